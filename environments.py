@@ -13,10 +13,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-# A user's terminal shows our own lines only.
-gym.logger.min_level = gym.logger.ERROR + 1
-logging.getLogger("absl").setLevel(logging.ERROR)
-warnings.filterwarnings("ignore")
+
+def silence():
+    """Keeps warnings and log lines of the packages below off the terminal, for a program that shows its own lines only."""
+    gym.logger.min_level = gym.logger.ERROR + 1
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    warnings.showwarning = lambda *args, **kwargs: None  # filters would not do: some packages set their own
 
 
 class FlatObservations(gym.Wrapper):

@@ -23,19 +23,19 @@ from torch import nn
 from tqdm import tqdm
 
 from colored_noise import ColoredNoiseProcess
-from environments import make_render_env, make_vector_env, record_video
+from environments import make_render_env, make_vector_env, record_video, silence
 from run_files import RunFolder, fail
 
 torch.set_num_threads(1)
 
 
 def number(kind, valid, description):
-    """An argparse type: a finite int or float for which valid(number) holds."""
+    """An argparse type: a finite int (1e6 is one) or float for which valid(number) holds."""
 
     def parse(text):
         try:
-            value = kind(text)
-            if math.isfinite(value) and valid(value):
+            value = kind(float(text))
+            if value == float(text) and math.isfinite(value) and valid(value):
                 return value
         except (ValueError, OverflowError):
             pass
@@ -240,7 +240,7 @@ def main():
     action_dim = int(np.prod(action_space.shape))
     low, high = action_space.low.reshape(-1), action_space.high.reshape(-1)
     if len(args.beta) not in (1, action_dim):
-        fail(f"--beta needs 1 value, or {action_dim}, one per action dimension of {args.env_id}", code=2)
+        fail(f"--beta has {len(args.beta)} values, but {args.env_id} has {action_dim} action dimensions", code=2)
     run = RunFolder(vars(args), {"obs_dim": obs_dim, "action_dim": action_dim})
     if run.summary:
         print(f"complete: final return {run.summary['final_return']:.4g} in {run.path} (--overwrite runs it again)")
@@ -381,6 +381,7 @@ def stop(number, _):
 
 
 if __name__ == "__main__":
+    silence()
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     try:

@@ -55,8 +55,11 @@ class RunFolder:
 
     def __init__(self, args, resolved):
         self.path, self.checkpoint, self.summary = run_path(args), None, None
-        self.path.mkdir(parents=True, exist_ok=True)
-        self._lock = open(self.path / "lock", "a")  # noqa: SIM115  held until the process ends
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.path / "lock", "a")  # noqa: SIM115  held until the process ends
+        except OSError as error:
+            fail(f"cannot write to {self.path} ({error.strerror}): choose another --runs-dir")
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

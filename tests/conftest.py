@@ -1,0 +1,32 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+os.environ["OMP_NUM_THREADS"] = "1"
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+import pytest  # noqa: E402
+
+SCRIPT = ROOT / "ppo_colored_continuous.py"
+TINY = "--total-timesteps 4096 --n-envs 2 --n-steps 256 --eval-freq 512 --eval-episodes 2 --n-epochs 1 --no-compile"
+
+
+@pytest.fixture
+def train(tmp_path):
+    """train("--beta 0", ...) runs the script to its end in tmp_path / "runs"; returns the completed process."""
+
+    def run(flags="", env=None, timeout=120):
+        command = [sys.executable, str(SCRIPT), "--runs-dir", str(tmp_path / "runs"), *flags.split()]
+        return subprocess.run(
+            command, capture_output=True, text=True, env={**os.environ, **(env or {})}, timeout=timeout
+        )
+
+    return run
+
+
+@pytest.fixture
+def tiny():
+    """Flags of a run of 8 updates and 8 evaluations that takes a few seconds."""
+    return TINY
