@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 
 def silence():
-    """Keeps warnings and log lines of the packages below off the terminal, for a program that shows its own lines only."""
+    """Keeps warnings and log lines of the packages used here off the terminal; a program calls it, a library should not."""
     gym.logger.min_level = gym.logger.ERROR + 1
     logging.getLogger("absl").setLevel(logging.ERROR)
     warnings.showwarning = lambda *args, **kwargs: None  # filters would not do: some packages set their own
@@ -77,6 +77,7 @@ def make_render_env(env_id):
     """Makes one environment that renders frames without a display; raises gymnasium.error.Error where it cannot."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains on machines without sound
     try:
         env = make_env(env_id, render_mode="rgb_array")
         env.reset()
@@ -92,6 +93,7 @@ def record_video(env, policy, path, seed):
     """Plays one episode of policy(obs (1, obs_dim)) -> actions (1, action_dim) and saves it as a video (.mp4)."""
     import imageio
 
+    path.parent.mkdir(exist_ok=True)
     fps = 1 / env.unwrapped.dt if hasattr(env.unwrapped, "dt") else env.metadata.get("render_fps", 30)
     obs, _ = env.reset(seed=seed)
     done = False

@@ -291,85 +291,86 @@ def main():
     dones = np.zeros((args.n_steps, args.n_envs), bool)
     next_obs, _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
     episode_return, episode_length = np.zeros(args.n_envs), np.zeros(args.n_envs)
-    n_updates = math.ceil(args.total_timesteps / steps_per_update)
-    bar = tqdm(total=n_updates * steps_per_update, initial=global_step, unit=" steps", unit_scale=True,
-               dynamic_ncols=True, mininterval=0.5 if sys.stderr.isatty() else 60)  # fmt: skip
+    total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
+    interval = 0.5 if sys.stderr.isatty() else 60
 
-    while True:
-        # Evaluate at every multiple of eval_freq at which this policy is the one that acts
-        while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
-            seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
-            returns, lengths = evaluate(policy, eval_envs, seeds)
-            run.add_evaluation(next_eval, returns, lengths)
-            bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
-            is_last = next_eval + args.eval_freq > args.total_timesteps
-            if video_env and (is_last or next_eval // args.eval_freq % 10 == 0):
-                record_video(video_env, policy, run.path / "videos" / f"step_{next_eval}.mp4", seeds[0])
-            next_eval += args.eval_freq
-        wall_seconds = earlier_seconds + time.time() - start_time
-        run.save_checkpoint(dict(optimizer=optimizer, noise=noise.state_dict(), torch_rng=torch.get_rng_state(),
-                                 global_step=global_step, next_eval=next_eval, wall_seconds=wall_seconds))  # fmt: skip
-        if global_step >= args.total_timesteps:
-            break
+    with tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True, mininterval=interval) as bar:
+        while True:
+            # Evaluate at every multiple of eval_freq at which this policy is the one that acts
+            while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
+                seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
+                returns, lengths = evaluate(policy, eval_envs, seeds)
+                run.add_evaluation(next_eval, returns, lengths)
+                bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
+                is_last = next_eval + args.eval_freq > args.total_timesteps
+                if video_env and (is_last or next_eval // args.eval_freq % 10 == 0):
+                    record_video(video_env, policy, run.path / "videos" / f"step_{next_eval}.mp4", seeds[0])
+                next_eval += args.eval_freq
+            wall_seconds = earlier_seconds + time.time() - start_time
+            counters = dict(global_step=global_step, next_eval=next_eval, wall_seconds=wall_seconds)
+            random_state = dict(noise=noise.state_dict(), torch_rng=torch.get_rng_state())
+            run.save_checkpoint({"optimizer": optimizer, **counters, **random_state})
+            if global_step >= args.total_timesteps:
+                break
 
-        # Collect n_steps in each environment
-        shape = (args.n_steps, args.n_envs, action_dim)
-        # This line is the paper: noise that is correlated over time, in place of white noise
-        eps = torch.randn(shape) if args.vanilla else noise.sample(args.n_steps)
-        eps, std = eps.numpy(), agent.log_std.exp().cpu().numpy()
-        timeouts, episodes = [], []
-        for t in range(args.n_steps):
-            obs[t] = next_obs
-            actions[t] = mean_action(next_obs) + std * eps[t]  # Eq. 2
-            next_obs, rewards[t], terminated, truncated, infos = envs.step(to_env(actions[t]))
-            dones[t] = terminated | truncated
-            episode_return += rewards[t]
-            episode_length += 1
-            for i in np.flatnonzero(dones[t]):
-                if not terminated[i]:
-                    timeouts.append((t, i, infos["final_obs"][i]))
-                episodes.append((episode_return[i], episode_length[i]))
-                episode_return[i] = episode_length[i] = 0
-            bar.update(args.n_envs)
-        global_step += steps_per_update
+            # Collect n_steps in each environment
+            shape = (args.n_steps, args.n_envs, action_dim)
+            # This line is the paper: noise that is correlated over time, in place of white noise
+            eps = torch.randn(shape) if args.vanilla else noise.sample(args.n_steps)
+            eps, std = eps.numpy(), agent.log_std.exp().cpu().numpy()
+            timeouts, episodes = [], []
+            for t in range(args.n_steps):
+                obs[t] = next_obs
+                actions[t] = mean_action(next_obs) + std * eps[t]  # Eq. 2
+                next_obs, rewards[t], terminated, truncated, infos = envs.step(to_env(actions[t]))
+                dones[t] = terminated | truncated
+                episode_return += rewards[t]
+                episode_length += 1
+                for i in np.flatnonzero(dones[t]):
+                    if not terminated[i]:
+                        timeouts.append((t, i, infos["final_obs"][i]))
+                    episodes.append((episode_return[i], episode_length[i]))
+                    episode_return[i] = episode_length[i] = 0
+                bar.update(args.n_envs)
+            global_step += steps_per_update
 
-        # Values, log-probabilities and advantages, for the whole batch at once
-        batch_obs, batch_actions = to_tensor(obs.reshape(-1, obs_dim)), to_tensor(actions.reshape(-1, action_dim))
-        logprobs, _, values = agent(batch_obs, batch_actions)
-        if args.bootstrap_timeouts and timeouts:
-            # A time limit is not the end of the task: what would have followed is worth V(final observation)
-            steps, indices, final_obs = zip(*timeouts, strict=True)
-            final_values = agent.critic(to_tensor(np.stack(final_obs))).squeeze(-1).cpu().numpy()
-            rewards[steps, indices] += args.gamma * final_values
-        last_values = agent.critic(to_tensor(next_obs)).squeeze(-1).cpu().numpy()
-        advantages, returns = compute_gae(
-            rewards, values.view(rewards.shape).cpu().numpy(), dones, last_values, args.gamma, args.gae_lambda
-        )
-        advantages, returns = to_tensor(advantages.reshape(-1)), to_tensor(returns.reshape(-1))
+            # Values, log-probabilities and advantages, for the whole batch at once
+            batch_obs, batch_actions = to_tensor(obs.reshape(-1, obs_dim)), to_tensor(actions.reshape(-1, action_dim))
+            logprobs, _, values = agent(batch_obs, batch_actions)
+            if args.bootstrap_timeouts and timeouts:
+                # A time limit is not the end of the task: what would have followed is worth V(final observation)
+                steps, indices, final_obs = zip(*timeouts, strict=True)
+                final_values = agent.critic(to_tensor(np.stack(final_obs))).squeeze(-1).cpu().numpy()
+                rewards[steps, indices] += args.gamma * final_values
+            last_values = agent.critic(to_tensor(next_obs)).squeeze(-1).cpu().numpy()
+            advantages, returns = compute_gae(
+                rewards, values.view(rewards.shape).cpu().numpy(), dones, last_values, args.gamma, args.gae_lambda
+            )
+            advantages, returns = to_tensor(advantages.reshape(-1)), to_tensor(returns.reshape(-1))
 
-        # Several epochs of minibatches
-        batch = (batch_obs, batch_actions, logprobs, advantages, returns)
-        metrics = []
-        for _ in range(args.n_epochs):
-            permutation = torch.randperm(steps_per_update).to(args.device)
-            for minibatch in zip(*(x[permutation].split(args.batch_size) for x in batch), strict=True):
-                optimizer, minibatch_metrics = update(optimizer, minibatch)
-                metrics.append(minibatch_metrics)
-        if not optimizer[0].isfinite().all():
-            fail(f"training diverged before step {global_step}, parameters are not finite: lower --learning-rate")
-        nn.utils.vector_to_parameters(optimizer[0], agent.parameters())
+            # Several epochs of minibatches
+            batch = (batch_obs, batch_actions, logprobs, advantages, returns)
+            metrics = []
+            for _ in range(args.n_epochs):
+                permutation = torch.randperm(steps_per_update).to(args.device)
+                for minibatch in zip(*(x[permutation].split(args.batch_size) for x in batch), strict=True):
+                    optimizer, minibatch_metrics = update(optimizer, minibatch)
+                    metrics.append(minibatch_metrics)
+            if not optimizer[0].isfinite().all():
+                fail(f"training diverged before step {global_step}, parameters are not finite: lower --learning-rate")
+            nn.utils.vector_to_parameters(optimizer[0], agent.parameters())
 
-        names = ["policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"]
-        scalars = {f"losses/{k}": v for k, v in zip(names, torch.stack(metrics).mean(0).tolist(), strict=True)}
-        scalars["losses/explained_variance"] = 1 - ((returns - values).var() / returns.var().clamp(min=1e-12)).item()
-        scalars["rollout/std"] = float(std.mean())
-        if episodes:
-            scalars["rollout/return_mean"], scalars["rollout/length_mean"] = np.mean(episodes, axis=0).tolist()
-        scalars["time/steps_per_second"] = steps_per_update / (time.time() - update_time)
-        update_time = time.time()
-        run.log(global_step, scalars)
+            names = ["policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"]
+            scalars = {f"losses/{k}": v for k, v in zip(names, torch.stack(metrics).mean(0).tolist(), strict=True)}
+            unexplained = (returns - values).var() / returns.var().clamp(min=1e-12)
+            scalars["losses/explained_variance"] = 1 - unexplained.item()
+            scalars["rollout/std"] = float(std.mean())
+            if episodes:
+                scalars["rollout/return_mean"], scalars["rollout/length_mean"] = np.mean(episodes, axis=0).tolist()
+            scalars["time/steps_per_second"] = steps_per_update / (time.time() - update_time)
+            update_time = time.time()
+            run.log(global_step, scalars)
 
-    bar.close()
     summary = run.finish(global_step, wall_seconds)
     print(f"performance {summary['performance']:.4g}, final return {summary['final_return']:.4g}, "
           f"{global_step:,} steps in {wall_seconds / 60:.1f} min: {run.path}")  # fmt: skip

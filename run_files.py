@@ -108,7 +108,9 @@ class RunFolder:
         self._buffer.seek(0)
         self._buffer.truncate()
         sizes = {name: (self.path / name).stat().st_size for name in ("evaluations.csv", *self._event_files())}
-        self._write("checkpoint.pt", lambda file: torch.save({**state, "file_sizes": sizes}, file))
+        data = io.BytesIO()  # straight to the file, torch.save would not raise an OSError on a full disk
+        torch.save({**state, "file_sizes": sizes}, data)
+        self._write("checkpoint.pt", data.getvalue())
 
     def finish(self, steps, wall_seconds):
         """Writes summary.json, which makes the run complete, and returns it."""
@@ -175,19 +177,17 @@ class RunFolder:
         with open(self.path / name, "ab") as file:
             file.write(data)
 
-    def _write(self, name, write):
-        """Replaces a file atomically; `write` gets the open temporary file."""
+    def _write(self, name, data):
         temporary = self.path / f"{name}.tmp"
         try:
-            with open(temporary, "wb") as file:
-                write(file)
+            temporary.write_bytes(data)
             os.replace(temporary, self.path / name)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
 
     def _write_json(self, name, value):
-        self._write(name, lambda file: file.write((json.dumps(value, indent=2) + "\n").encode()))
+        self._write(name, (json.dumps(value, indent=2) + "\n").encode())
 
     def _read_json(self, name):
         try:
