@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 
 def silence():
-    """Keeps warnings and log lines of the packages used here off the terminal; a program calls it, a library should not."""
+    """Keeps the warnings and log lines of the packages used here off the terminal. For a program, not for a library."""
     gym.logger.min_level = gym.logger.ERROR + 1
     logging.getLogger("absl").setLevel(logging.ERROR)
     warnings.showwarning = lambda *args, **kwargs: None  # filters would not do: some packages set their own
