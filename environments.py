@@ -4,6 +4,7 @@ Importing this file is quick and silent: the package behind an environment is im
 """
 
 import difflib
+import functools
 import logging
 import os
 import warnings
@@ -11,7 +12,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 
 def silence():
@@ -63,14 +64,88 @@ def make_env(env_id, **kwargs):
     return FlatObservations(env)
 
 
-def make_vector_env(env_id, n_envs):
+def make_vector_env(env_id, n_envs, envpool=False):
     """Makes n_envs environments that step together: observations (n_envs, obs_dim) float32, SAME_STEP autoreset.
 
     The step that ends an episode returns the next episode's first observation, and the ended one's last observation in
     infos["final_obs"]. Gymnasium's default, NEXT_STEP, inserts a dummy transition between episodes instead.
-    Observations are overwritten by the next step. Raises as make_env does.
+    Observations are overwritten by the next step. Raises as make_env does. With envpool they are EnvPool's.
     """
+    if envpool:
+        return EnvPoolVectorEnv(env_id, n_envs)
     return SyncVectorEnv([lambda: make_env(env_id)] * n_envs, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+ENVPOOL_TASKS = {
+    "MountainCarContinuous-v0": "MountainCarContinuous-v0",
+    "dm_control/ball_in_cup-catch-v0": "BallInCupCatch-v1",
+    "dm_control/cartpole-balance_sparse-v0": "CartpoleBalanceSparse-v1",
+    "dm_control/cartpole-swingup_sparse-v0": "CartpoleSwingupSparse-v1",
+    "dm_control/cheetah-run-v0": "CheetahRun-v1",
+    "dm_control/hopper-hop-v0": "HopperHop-v1",
+    "dm_control/pendulum-swingup-v0": "PendulumSwingup-v1",
+    "dm_control/reacher-hard-v0": "ReacherHard-v1",
+    "dm_control/walker-run-v0": "WalkerRun-v1",
+    "door-v0": "AdroitHandDoor-v1",
+}
+
+
+class EnvPoolVectorEnv(VectorEnv):
+    """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds (see reset).
+
+    Raises gymnasium.error.Error, with a message for the user, for other tasks and where EnvPool is not installed.
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, env_id, n_envs):
+        if env_id not in ENVPOOL_TASKS:
+            raise gym.error.Error(f"--envpool does not have {env_id}, only {', '.join(ENVPOOL_TASKS)}")
+        try:
+            import envpool
+        except ImportError as error:
+            raise gym.error.DependencyNotInstalled(f"--envpool needs EnvPool (pip install envpool): {error}") from error
+        self._make = functools.partial(envpool.make_gymnasium, ENVPOOL_TASKS[env_id], num_envs=n_envs, num_threads=1)
+        spec = envpool.make_spec(ENVPOOL_TASKS[env_id])
+        self.num_envs, self._pool, self._is_door = n_envs, None, env_id == "door-v0"
+        obs_dim = spaces.flatdim(spec.gymnasium_observation_space)
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
+        action_space = spec.gymnasium_action_space
+        self.single_action_space = spaces.Box(action_space.low, action_space.high, dtype=np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        """Starts new episodes. Only the first reset heeds the seeds, a list of n_envs integers below 2^32.
+
+        EnvPool takes its seeds when it is made, which takes seconds; the environments' generators run on afterwards.
+        """
+        if self._pool is None:
+            seed = range(self.num_envs) if seed is None else seed
+            self._pool = self._make(seed=np.array(seed, np.uint32).view(np.int32))  # EnvPool's seeds are int32
+            self._fresh = np.zeros(self.num_envs, bool)
+            self._obs = np.empty((self.num_envs, *self.single_observation_space.shape), np.float32)
+        self._begin_episodes(np.flatnonzero(~self._fresh))  # the others have just been reset by step
+        return self._obs.copy(), {}
+
+    def step(self, actions):
+        obs, rewards, terminated, truncated, _ = self._pool.step(actions)
+        self._obs = self._flatten(obs)
+        if self._is_door:  # as in make_env: EnvPool has the sign of the reaching term flipped as well
+            rewards = rewards - 0.2 * np.linalg.norm(self._obs[:, -4:-1], axis=1)
+        infos = {}
+        self._fresh = terminated | truncated
+        if self._fresh.any():
+            infos["final_obs"] = self._obs.copy()
+            self._begin_episodes(np.flatnonzero(self._fresh))
+        return self._obs, rewards, terminated, truncated, infos
+
+    def _begin_episodes(self, indices):
+        if len(indices):
+            self._obs[indices] = self._flatten(self._pool.reset(indices)[0])
+            self._fresh[indices] = True
+
+    def _flatten(self, obs):
+        parts = [obs[key] for key in sorted(obs)] if isinstance(obs, dict) else [obs]
+        return np.concatenate([x.reshape(len(x), -1) for x in parts], axis=1, dtype=np.float32)
 
 
 def make_render_env(env_id):
