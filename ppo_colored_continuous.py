@@ -100,8 +100,8 @@ def parse_args():
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
     try:
         torch.zeros(1, device=args.device).cpu()
-    except (RuntimeError, AssertionError) as error:
-        parser.error(f"--device {args.device} cannot be used: {str(error).splitlines()[0]}")
+    except (RuntimeError, AssertionError):
+        parser.error(f"--device {args.device} is not available here")
     return args
 
 

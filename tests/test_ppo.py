@@ -262,35 +262,33 @@ def test_whole_rollout_against_sb3(monkeypatch, tmp_path, bootstrap):
 
 
 class Count(gym.Env):
-    """Counts its steps: observation t, reward t. Ends after 5 steps, or by a time limit of 5."""
+    """Counts its steps: observation t, reward t. It terminates after as many steps as its seed says, 5 by default."""
 
     observation_space = gym.spaces.Box(0, 10, (1,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
-    def __init__(self, terminates):
-        self.terminates = terminates
-
     def reset(self, seed=None, options=None):
-        self.t = 0
+        self.t, self.length = 0, seed or 5
         return np.array([0.0]), {}
 
     def step(self, action):
         self.t += 1
-        return np.array([float(self.t)]), float(self.t), self.terminates and self.t == 5, False, {}
+        return np.array([float(self.t)]), float(self.t), self.t == self.length, False, {}
 
 
-gym.register("CountTerminated-v0", lambda **kwargs: Count(True))
-gym.register("CountTruncated-v0", lambda **kwargs: Count(False), max_episode_steps=5)
+gym.register("CountTerminated-v0", Count)
+gym.register("CountTruncated-v0", Count, max_episode_steps=5)
 
 
 @pytest.mark.parametrize("env_id", ["CountTerminated-v0", "CountTruncated-v0"])
 def test_autoreset_inserts_no_dummy_transition(env_id):
     envs = make_vector_env(env_id, 2)
     assert envs.autoreset_mode is AutoresetMode.SAME_STEP
-    obs, _ = envs.reset(seed=[1, 2])
+    obs, _ = envs.reset(seed=[10, 10] if env_id == "CountTruncated-v0" else [5, 5])
     assert obs.dtype == np.float32 and obs.shape == (2, 1)
     seen, rewards = [obs[0, 0].item()], []
     for _ in range(10):
+        envs.envs[0].unwrapped.length = 10 if env_id == "CountTruncated-v0" else 5
         obs, reward, terminated, truncated, infos = envs.step(np.zeros((2, 1), np.float32))
         seen.append(obs[0, 0].item())
         rewards.append(reward[0].item())
@@ -303,8 +301,8 @@ def test_autoreset_inserts_no_dummy_transition(env_id):
 
 def test_evaluation_counts_whole_episodes_once():
     envs = make_vector_env("CountTruncated-v0", 3)
-    returns, lengths = ppo.evaluate(lambda obs: np.zeros((3, 1), np.float32), envs, [1, 2, 3])
-    assert returns.tolist() == [15, 15, 15] and lengths.tolist() == [5, 5, 5]
+    returns, lengths = ppo.evaluate(lambda obs: np.zeros((3, 1), np.float32), envs, [3, 10, 1])
+    assert returns.tolist() == [6, 15, 1] and lengths.tolist() == [3, 5, 1]
 
 
 def test_evaluation_is_seeded_and_leaves_all_generators_alone():
