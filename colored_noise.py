@@ -121,7 +121,7 @@ def marginal_variance(beta, T):
 
 
 def mean_std(beta, T):
-    """Standard deviation of the mean of a sequence, the "bias" of Fig. 5b: the DC bin's share of the variance."""
+    """Standard deviation of the mean of a sequence, the paper's "bias": the DC bin's share of the variance."""
     return expected_psd(beta, T)[..., 0].sqrt() / T
 
 

@@ -3,10 +3,14 @@
 Importing this file is quick and silent: the package behind an environment is imported when one is made.
 """
 
+import contextlib
 import difflib
 import functools
+import io
 import logging
+import math
 import os
+import re
 import warnings
 
 import gymnasium as gym
@@ -20,6 +24,33 @@ def silence():
     gym.logger.min_level = gym.logger.ERROR + 1
     logging.getLogger("absl").setLevel(logging.ERROR)
     warnings.showwarning = lambda *args, **kwargs: None  # filters would not do: some packages set their own
+
+
+# --- The mazes and the Adroit door
+MAZE_IDS = ["PointUMaze-v1", "Point4Rooms-v1", "AntUMaze-v1", "Ant4Rooms-v1", "SwimmerUMaze-v1", "Swimmer4Rooms-v1"]
+MAZE_IDS += ["PointPush-v1", "AntPush-v1", "PointPushMaze-v1", "AntPushMaze-v1"]
+for env_id in MAZE_IDS:  # Gymnasium's checks of every step would cost more than the point's physics
+    robot, maze = re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id).groups()
+    kwargs = {"robot": robot.lower(), "maze": maze}
+    gym.register(env_id, "mazes:MazeEnv", max_episode_steps=1000, disable_env_checker=True, kwargs=kwargs)
+gym.register("door-v0", "environments:make_door", max_episode_steps=200, disable_env_checker=True)
+
+
+def make_door(**kwargs):
+    """Makes D4RL's `door-v0` (dense reward) from gymnasium-robotics; takes the arguments of its AdroitHandDoorEnv.
+
+    The package's AdroitHandDoor-v1 rewards the distance between palm and handle with +0.1 per m, D4RL with -0.1.
+    """
+    with contextlib.redirect_stderr(io.StringIO()):  # importing the package prints a notice
+        from gymnasium_robotics.envs.adroit_hand.adroit_door import AdroitHandDoorEnv
+
+    class AdroitDoor(AdroitHandDoorEnv):
+        def step(self, action):
+            obs, reward, terminated, truncated, info = super().step(action)
+            palm_to_handle = math.hypot(*obs[-4:-1])
+            return obs, reward - 0.2 * palm_to_handle, terminated, truncated, info
+
+    return AdroitDoor(**kwargs)
 
 
 class FlatObservations(gym.Wrapper):
@@ -107,7 +138,7 @@ class EnvPoolVectorEnv(VectorEnv):
             raise gym.error.DependencyNotInstalled(f"--envpool needs EnvPool (pip install envpool): {error}") from error
         self._make = functools.partial(envpool.make_gymnasium, ENVPOOL_TASKS[env_id], num_envs=n_envs, num_threads=1)
         spec = envpool.make_spec(ENVPOOL_TASKS[env_id])
-        self.num_envs, self._pool, self._is_door = n_envs, None, env_id == "door-v0"
+        self.env_id, self.num_envs, self._pool = env_id, n_envs, None
         obs_dim = spaces.flatdim(spec.gymnasium_observation_space)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
         action_space = spec.gymnasium_action_space
@@ -129,8 +160,13 @@ class EnvPoolVectorEnv(VectorEnv):
     def step(self, actions):
         obs, rewards, terminated, truncated, _ = self._pool.step(actions)
         self._obs = self._flatten(obs)
-        if self._is_door:  # as in make_env: EnvPool has the sign of the reaching term flipped as well
+        if self.env_id == "door-v0":  # EnvPool has the sign of the reaching term flipped as well
             rewards = rewards - 0.2 * np.linalg.norm(self._obs[:, -4:-1], axis=1)
+        elif self.env_id == "dm_control/ball_in_cup-catch-v0":
+            # EnvPool takes the size of the cup's wall, 0.008, for the ball's, 0.025, and so pays for balls half outside.
+            # The observation begins with the positions (x, z) of cup and ball, relative to (0, 0.6) and (0, 0.2).
+            ball_to_target = self._obs[:, :2] - self._obs[:, 2:4] + (0, 0.6 - 0.05 - 0.2)
+            rewards = (np.abs(ball_to_target) < 0.05 - 0.025).all(axis=1).astype(np.float32)
         infos = {}
         self._fresh = terminated | truncated
         if self._fresh.any():
