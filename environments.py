@@ -3,6 +3,7 @@
 Importing this file is quick and silent: the package behind an environment is imported when one is made.
 """
 
+import argparse
 import contextlib
 import difflib
 import functools
@@ -37,7 +38,7 @@ gym.register("door-v0", "environments:make_door", max_episode_steps=200, disable
 
 
 def make_door(**kwargs):
-    """Makes D4RL's `door-v0` (dense reward) from gymnasium-robotics; takes the arguments of its AdroitHandDoorEnv.
+    """Makes D4RL's `door-v0` from gymnasium-robotics; takes the arguments of its AdroitHandDoorEnv but reward_type.
 
     The package's AdroitHandDoor-v1 rewards the distance between palm and handle with +0.1 per m, D4RL with -0.1.
     """
@@ -50,7 +51,7 @@ def make_door(**kwargs):
             palm_to_handle = math.hypot(*obs[-4:-1])
             return obs, reward - 0.2 * palm_to_handle, terminated, truncated, info
 
-    return AdroitDoor(**kwargs)
+    return AdroitDoor(reward_type="dense", **kwargs)
 
 
 class FlatObservations(gym.Wrapper):
@@ -163,7 +164,7 @@ class EnvPoolVectorEnv(VectorEnv):
         if self.env_id == "door-v0":  # EnvPool has the sign of the reaching term flipped as well
             rewards = rewards - 0.2 * np.linalg.norm(self._obs[:, -4:-1], axis=1)
         elif self.env_id == "dm_control/ball_in_cup-catch-v0":
-            # EnvPool takes the size of the cup's wall, 0.008, for the ball's, 0.025, and so pays for balls half outside.
+            # EnvPool takes the radius of the cup's wall, 0.008, for the ball's, 0.025, and pays for balls half outside.
             # The observation begins with the positions (x, z) of cup and ball, relative to (0, 0.6) and (0, 0.2).
             ball_to_target = self._obs[:, :2] - self._obs[:, 2:4] + (0, 0.6 - 0.05 - 0.2)
             rewards = (np.abs(ball_to_target) < 0.05 - 0.025).all(axis=1).astype(np.float32)
@@ -188,6 +189,7 @@ def make_render_env(env_id):
     """Makes one environment that renders frames without a display; raises gymnasium.error.Error where it cannot."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains on machines without sound
     try:
         env = make_env(env_id, render_mode="rgb_array")
@@ -213,3 +215,38 @@ def record_video(env, policy, path, seed):
             video.append_data(env.render())
             obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])
             done = terminated or truncated
+
+
+def contact_sheet(path):
+    """Saves a frame of each of the paper's environments, in the order of its figure of them, as a picture."""
+    from plot import NAMES, plt
+
+    tasks = ["cartpole-balance_sparse", "cartpole-swingup_sparse", "ball_in_cup-catch", "hopper-hop", "cheetah-run"]
+    tasks += ["walker-run", "reacher-hard", "pendulum-swingup"]
+    ids = ["MountainCarContinuous-v0", *(f"dm_control/{task}-v0" for task in tasks), "door-v0", "PointUMaze-v1"]
+    ids += ["AntUMaze-v1", "Point4Rooms-v1", "SwimmerUMaze-v1", "Swimmer4Rooms-v1", "Ant4Rooms-v1", *MAZE_IDS[-4:]]
+
+    def first_frame(env_id):  # a function, so that this environment's renderer is gone before the next one's is made
+        env = make_render_env(env_id)
+        env.reset(seed=1)
+        frame = env.render()
+        env.close()
+        return frame[:, 40:280] if env_id.startswith("dm_control/") else frame  # without the scene's left and right
+
+    fig, axes = plt.subplots(4, 5, figsize=(12, 10.2), layout="constrained")
+    for ax, env_id in zip(axes.flat, ids, strict=True):
+        ax.imshow(first_frame(env_id))
+        ax.set_title(NAMES[env_id])
+        ax.axis("off")
+    fig.savefig(path, dpi=85)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Saves a picture of the paper's environments.")
+    parser.add_argument("--out", default="results/environments.png", help="the picture's file")
+    out = parser.parse_args().out
+    silence()
+    try:
+        contact_sheet(out)
+    except (OSError, ValueError, gym.error.Error) as error:
+        parser.exit(1, f"cannot make the picture {out}: {error}\n")

@@ -1,0 +1,327 @@
+"""The maze tasks of mujoco-maze (https://github.com/kngwyu/mujoco-maze), rebuilt on today's MuJoCo and Gymnasium.
+
+An ant, a point or a swimmer has to find a goal in a maze of square cells, in some mazes by pushing blocks out of its
+way. The original package needs gym and mujoco-py; this file needs neither and follows its version 1 tasks (a sparse
+reward at the goal) as they were before it moved to gym 0.26. Every environment is one `MazeEnv`:
+
+    gymnasium.make("AntUMaze-v1")                       # after `import environments`, which registers the ids
+    mazes.MazeEnv(robot="ant", maze="UMaze")            # the same, without the limit of 1000 steps
+
+The robots are the XML models that Gymnasium ships; what differs from them is changed in `build_model`.
+"""
+
+import math
+import weakref
+from pathlib import Path
+from typing import NamedTuple
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+
+GOAL_RADIUS = 0.6  # m, in the plane
+STEP_REWARD = -0.0001  # a step that does not reach the goal
+INNER_REWARD = 0.01  # weight of the reward for moving
+CONTROL_COST = 1e-4  # weight of sum(action^2) in the reward for moving
+POINT_RADIUS = 0.4  # m, of the point when it is reflected at walls; its body has 0.5
+RESTITUTION = 0.8  # the part of the remaining way that the point keeps when a wall reflects it
+POINT_MAX_VELOCITY = 10.0
+
+
+class Maze(NamedTuple):
+    grid: str  # '#' wall, '.' free, 'R' robot, 'M' block movable in x and y; columns run along +x, rows along +y
+    goal: tuple[float, float]  # (x, y) in cells, seen from the robot's cell
+    scale: dict[str, float]  # side of a cell in m, for each robot that the task has
+
+
+MAZES = {
+    "UMaze": Maze(
+        """
+        #####
+        #R..#
+        ###.#
+        #...#
+        #####
+        """,
+        goal=(0, 2),
+        scale={"ant": 8, "point": 4, "swimmer": 4},
+    ),
+    "4Rooms": Maze(
+        """
+        #########
+        #...#...#
+        #.......#
+        #...#...#
+        ##.###.##
+        #...#...#
+        #.......#
+        #R..#...#
+        #########
+        """,
+        goal=(6, -6),
+        scale={"ant": 4, "point": 4, "swimmer": 4},
+    ),
+    "Push": Maze(
+        """
+        #####
+        #.R##
+        #.M.#
+        ##.##
+        #####
+        """,
+        goal=(0, 2.375),
+        scale={"ant": 8, "point": 4},
+    ),
+    "PushMaze": Maze(
+        """
+        #######
+        #..RM.#
+        ####.##
+        #.M.M##
+        ##.#.##
+        #######
+        """,
+        goal=(3, 0),  # inside the outer wall, as in the original: out of reach
+        scale={"ant": 2, "point": 6},
+    ),
+}
+
+
+class Robot(NamedTuple):
+    nq: int  # coordinates of the robot; those of the blocks follow
+    nv: int
+    timestep: float  # s
+    substeps: int  # of the physics per environment step
+
+
+ROBOTS = {"ant": Robot(15, 14, 0.02, 5), "point": Robot(3, 3, 0.02, 1), "swimmer": Robot(5, 5, 0.01, 4)}
+
+
+def read_grid(grid, scale):
+    """The cells of a text grid as (character, x, y) in reading order; centers (x, y) in m, the robot's at (0, 0)."""
+    rows = grid.split()
+    row0, col0 = next((i, row.index("R")) for i, row in enumerate(rows) if "R" in row)
+    return [(c, (j - col0) * scale, (i - row0) * scale) for i, row in enumerate(rows) for j, c in enumerate(row)]
+
+
+def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
+    """The robot's model from Gymnasium, changed to mujoco-maze's, with the maze around it. Returns a mujoco.MjModel."""
+    spec = mujoco.MjSpec.from_file(str(Path(gym.__file__).parent / f"envs/mujoco/assets/{robot}.xml"))
+    spec.option.timestep = ROBOTS[robot].timestep
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # same contacts; the ant's steps take 10 % less
+    has_blocks = any(c == "M" for c, _, _ in cells)
+    if robot == "ant":
+        for actuator in spec.actuators:
+            actuator.gear[0] = 1
+            actuator.ctrlrange = [-30, 30]
+    if robot == "swimmer":  # it swims through the walls, in the original too
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+
+    # The spec's default goes to the geoms that are added below; those of the XML are made already.
+    solimp = [0.995, 0.995, 0.01] if has_blocks else [0.8, 0.8, 0.01] if robot == "ant" else None
+    for geom in [spec.default.geom, *spec.geoms]:
+        if geom.name in ("pointbody", "pointarrow"):
+            geom.solimp[:3] = [0.9, 0.99, 0.001]
+        elif solimp:
+            geom.solimp[:3] = solimp
+        if geom.name != "floor":
+            geom.material, geom.rgba = "", [0.95, 0.45, 0.05, 1]
+    floor, tiles = spec.material("MatPlane"), spec.texture("texplane")
+    floor.reflectance, tiles.rgb1, tiles.rgb2 = 0, [0.80, 0.82, 0.85], [0.70, 0.72, 0.76]
+
+    height = scale / 2
+    box = dict(type=mujoco.mjtGeom.mjGEOM_BOX, size=[scale / 2, scale / 2, height / 2], contype=1, conaffinity=1)
+    for i, (c, x, y) in enumerate(cells):
+        if c == "#":
+            spec.worldbody.add_geom(**box, name=f"wall_{i}", pos=[x, y, height / 2], rgba=[0.35, 0.4, 0.5, 1])
+        elif c == "M":
+            body = spec.worldbody.add_body(name=f"block_{i}", pos=[x, y, height / 2])
+            body.add_geom(**box, name=f"block_{i}", mass=0.0002, rgba=[0.75, 0.15, 0.2, 1])
+            for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0])):
+                joint = body.add_joint(name=f"block_{i}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+                joint.limited, joint.armature, joint.damping, joint.margin = 0, 0, [0, 0, 0], 0.01
+    # A post as wide as the goal, which stands out of the wall where the goal is inside one.
+    post = dict(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[GOAL_RADIUS, 0.7 * height, 0], rgba=[0.1, 0.7, 0.1, 1])
+    spec.worldbody.add_site(**post, name="goal", pos=[*goal, 0.7 * height])
+
+    model = spec.compile()
+    if old_capsule_inertia:
+        set_old_capsule_inertia(model)
+    return model
+
+
+def set_old_capsule_inertia(model):
+    """Give every body made of one capsule the mass and inertia that MuJoCo computed until 2.1.1, in place.
+
+    A capsule of radius r and cylinder length L was taken for a cylinder of height h = L + r. The swimmer's fluid drag
+    and so its returns depend on it: the published ones need the old values.
+    """
+    for body in range(1, model.nbody):
+        first, count = model.body_geomadr[body], model.body_geomnum[body]
+        if count == 1 and model.geom_type[first] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            r, half_length, _ = model.geom_size[first]
+            h = 2 * half_length + r
+            mass = model.body_mass[body] * h / (h + r / 3)  # the exact volume is pi r^2 (L + 4 r / 3)
+            across = mass * (3 * r**2 + h**2) / 12
+            model.body_mass[body] = mass
+            model.body_inertia[body] = [across, across, mass * r**2 / 2]  # the capsule's axis is the third
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+class WallReflection:
+    """Reflects the point's moves at the faces of the walls, which stand out by the point's radius.
+
+    The original has no face where a wall adjoins the first cell of a block. Its point can leave PushMaze there; this
+    one cannot.
+    """
+
+    def __init__(self, cells, scale):
+        reach = scale / 2 + POINT_RADIUS
+        free = {(x, y) for c, x, y in cells if c != "#"}
+        self.faces = []  # (axis, position on it, low and high end on the other axis)
+        for c, x, y in cells:
+            for axis, dx, dy in ((1, 0, -1), (0, -1, 0), (1, 0, 1), (0, 1, 0)):
+                if c == "#" and (x + dx * scale, y + dy * scale) in free:
+                    across, along = (x + dx * reach, y) if axis == 0 else (y + dy * reach, x)
+                    self.faces.append((axis, across, along - reach, along + reach))
+
+    def first_crossing(self, start, end):
+        """The nearest crossing of the segment start-end with a face: (distance / length, face), or None."""
+        nearest = None
+        delta = (end[0] - start[0], end[1] - start[1])
+        for face in self.faces:
+            axis, across, low, high = face
+            a, b = start[axis] - across, end[axis] - across
+            if a * b <= 0 and a != b:
+                t = a / (a - b)
+                if low <= start[1 - axis] + t * delta[1 - axis] <= high and (nearest is None or t < nearest[0]):
+                    nearest = (t, face)
+        return nearest
+
+    def __call__(self, start, end):
+        """Where a move from start to end arrives. Points are (x, y); returns `end` itself if no wall is in the way."""
+        hit = self.first_crossing(start, end)
+        if hit is None:
+            return end
+        t, (axis, across, _, _) = hit
+        crossing = [s + t * (e - s) for s, e in zip(start, end, strict=True)]
+        mirrored = list(end)
+        mirrored[axis] = 2 * across - end[axis]
+        arrival = tuple(c + RESTITUTION * (m - c) for c, m in zip(crossing, mirrored, strict=True))
+        return start if self.first_crossing(start, arrival) else arrival
+
+
+class MazeEnv(gym.Env):
+    """A robot that looks for a goal in a maze.
+
+    Arguments:
+        robot: "ant", "point" or "swimmer".
+        maze: a key of `MAZES`.
+        goal: (x, y) in m from the center of the robot's cell; default: the maze's own.
+        old_capsule_inertia: masses and inertias as in MuJoCo before 2.1.2, with which the published results were made.
+        render_mode: None or "rgb_array": the whole maze from above, (480, 480, 3) uint8.
+
+    Action: joint torques in [-30, 30] N m (ant, 8) or [-1, 1] times 150 N m (swimmer, 2); for the point a step forward
+    in [-1, 1] m and, before it, a turn in [-0.25, 0.25] rad. Actions beyond are clipped.
+    Observation: the robot's first three coordinates, the position (x, y, z) of each block, the robot's other
+    coordinates, its velocities, 0.001 * step.
+    Reward: 1 within 0.6 m of the goal, which terminates the episode, otherwise -0.0001; for ant and swimmer also
+    0.01 * (speed in m/s - 1e-4 * sum(action^2)). `info["success"]` says whether the goal is reached.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}
+
+    def __init__(self, robot, maze, goal=None, old_capsule_inertia=True, render_mode=None):
+        if maze not in MAZES or robot not in MAZES[maze].scale:
+            choices = ", ".join(f"{r} in {m}" for m in MAZES for r in MAZES[m].scale)
+            raise ValueError(f"no maze task for robot {robot!r} in maze {maze!r}; there are {choices}")
+        self.robot, self.render_mode = robot, render_mode
+        self.nq, self.nv, timestep, self.substeps = ROBOTS[robot]
+        self.dt = timestep * self.substeps
+        self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
+        scale = MAZES[maze].scale[robot]
+        self.goal = tuple(goal) if goal is not None else tuple(scale * c for c in MAZES[maze].goal)
+
+        self.cells = read_grid(MAZES[maze].grid, scale)
+        self.reflect = WallReflection(self.cells, scale)
+        self.model = build_model(robot, self.cells, scale, self.goal, old_capsule_inertia)
+        self.data = mujoco.MjData(self.model)
+        # Views into MuJoCo's memory, kept because making one takes as long as using it.
+        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        n_blocks = (self.model.nq - self.nq) // 2
+        self._block_pos = self.data.xpos[self.model.nbody - n_blocks :].reshape(-1)  # (3 * n_blocks,)
+
+        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.nq + self.nv + 3 * n_blocks + 1,), np.float64)
+        self._low, self._high = self.model.actuator_ctrlrange.T.copy()
+        self._renderer = None
+
+    def reset(self, *, seed=None, options=None):
+        """Start an episode: coordinates and velocities drawn around the model's own, blocks at rest in place."""
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self._steps = 0
+        self._qpos[: self.nq] += self.np_random.uniform(-0.1, 0.1, self.nq)
+        if self.robot == "swimmer":
+            self._qvel[:] = self.np_random.uniform(-0.1, 0.1, self.nv)
+        else:
+            self._qvel[: self.nv] = 0.1 * self.np_random.standard_normal(self.nv)
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+    def step(self, action):
+        """One step of `dt` seconds with an action of shape (action_dim,)."""
+        self._steps += 1
+        action = np.minimum(np.maximum(action, self._low), self._high)
+        if self.robot == "point":
+            self._move_point(*action.tolist())
+            reward = 0.0
+        else:
+            x, y = self._qpos[:2].tolist()
+            self._ctrl[:] = action
+            mujoco.mj_step(self.model, self.data, self.substeps)
+            speed = math.hypot(self._qpos[0] - x, self._qpos[1] - y) / self.dt
+            reward = INNER_REWARD * (speed - CONTROL_COST * float(action @ action))
+        reached = math.hypot(self._qpos[0] - self.goal[0], self._qpos[1] - self.goal[1]) <= GOAL_RADIUS
+        reward += 1.0 if reached else STEP_REWARD
+        return self._observation(), reward, reached, False, {"success": reached}
+
+    def _move_point(self, forward, turn):
+        """Turn and move the point by changing its coordinates, let the physics do one step, then mind the walls."""
+        x, y, heading = self._qpos[:3].tolist()
+        heading += turn
+        if abs(heading) > math.pi:
+            heading -= math.copysign(2 * math.pi, heading)
+        self._qpos[:3] = x + forward * math.cos(heading), y + forward * math.sin(heading), heading
+        np.clip(self._qvel, -POINT_MAX_VELOCITY, POINT_MAX_VELOCITY, out=self._qvel)
+        mujoco.mj_step(self.model, self.data)
+        self._qpos[:2] = self.reflect((x, y), tuple(self._qpos[:2].tolist()))
+
+    def _observation(self):
+        nq, nv = self.nq, self.nv
+        if self._block_pos.size:  # mj_step leaves positions where the integrator's last stage had them
+            mujoco.mj_kinematics(self.model, self.data)
+        parts = (self._qpos[:3], self._block_pos, self._qpos[3:nq], self._qvel[:nv], (0.001 * self._steps,))
+        return np.concatenate(parts)
+
+    def render(self):
+        """The maze from above as an RGB image, (480, 480, 3) uint8, if `render_mode` is "rgb_array"."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self.model, 480, 480)
+            weakref.finalize(self, self._renderer.close)  # at exit at the latest, while OpenGL still works
+            xy = np.array([(x, y) for _, x, y in self.cells])
+            self._camera = mujoco.MjvCamera()
+            self._camera.lookat = [*(xy.min(0) + xy.max(0)) / 2, 0]
+            self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.55 * np.ptp(xy, 0).max(), 90, -65
+        mujoco.mj_kinematics(self.model, self.data)
+        self._renderer.update_scene(self.data, self._camera)
+        return self._renderer.render()
+
+    def close(self):
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

@@ -1,0 +1,409 @@
+"""The mazes against figures worked out by hand from the original's rules."""
+
+import math
+import os
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import environments  # noqa: F401  registers the ids
+from mazes import MazeEnv, WallReflection, read_grid
+
+#      id                 obs  action high     goal (x, y)  s/step  blocks' first (x, y)
+TASKS = {
+    "PointUMaze-v1": (7, [1, 0.25], (0, 8), 0.02, []),
+    "Point4Rooms-v1": (7, [1, 0.25], (24, -24), 0.02, []),
+    "PointPush-v1": (10, [1, 0.25], (0, 9.5), 0.02, [(0, 4)]),
+    "PointPushMaze-v1": (16, [1, 0.25], (18, 0), 0.02, [(6, 0), (-6, 12), (6, 12)]),
+    "AntUMaze-v1": (30, [30] * 8, (0, 16), 0.1, []),
+    "Ant4Rooms-v1": (30, [30] * 8, (24, -24), 0.1, []),
+    "AntPush-v1": (33, [30] * 8, (0, 19), 0.1, [(0, 8)]),
+    "AntPushMaze-v1": (39, [30] * 8, (6, 0), 0.1, [(2, 0), (-2, 4), (2, 4)]),
+    "SwimmerUMaze-v1": (11, [1, 1], (0, 8), 0.04, []),
+    "Swimmer4Rooms-v1": (11, [1, 1], (24, -24), 0.04, []),
+}
+SIZES = {"Point": (3, 3), "Ant": (15, 14), "Swimmer": (5, 5)}  # nq, nv
+QPOS0 = {"Point": [0] * 3, "Ant": [0, 0, 0.75, 1] + [0] * 11, "Swimmer": [0] * 5}
+POINT_MAZES = [env_id for env_id in TASKS if env_id.startswith("Point")]
+
+
+def make(env_id, **kwargs):
+    return gym.make(env_id, **kwargs).unwrapped
+
+
+def robot_of(env_id):
+    return next(robot for robot in SIZES if env_id.startswith(robot))
+
+
+def place(env, x, y, **velocities):
+    """Puts the robot at (x, y), upright and at rest but for the given velocities by coordinate number."""
+    env.reset(seed=0)
+    mujoco.mj_resetData(env.model, env.data)
+    env.data.qpos[:2] = x, y
+    for i, v in velocities.items():
+        env.data.qvel[int(i[1:])] = v
+
+
+def walls_of(env_id):
+    """The walls' centers (n, 2), side and height in m, from the compiled model instead of the grid."""
+    model = make(env_id).model
+    walls = [i for i in range(model.ngeom) if model.geom(i).name.startswith("wall")]
+    return model.geom_pos[walls][:, :2], 2 * model.geom_size[walls[0], 0], model.geom_size[walls[0], 2] * 2
+
+
+# Cells that are not walls, (x, y) counted from the robot's.
+ROOMS = [(x, y) for x in (0, 1, 2, 4, 5, 6) for y in (-6, -5, -4, -2, -1, 0)]
+FREE = {
+    "UMaze": [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 2)],
+    "4Rooms": [*ROOMS, (3, -5), (3, -1), (1, -3), (5, -3)],  # and the doors between them
+    "Push": [(-1, 0), (0, 0), (-1, 1), (0, 1), (1, 1), (0, 2)],
+    "PushMaze": [*((x, 0) for x in range(-2, 3)), (1, 1), *((x, 2) for x in range(-2, 2)), (-1, 3), (1, 3)],
+}
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_walls_stand_where_they_should(env_id):
+    walls, side, height = walls_of(env_id)
+    free = np.array(FREE[env_id.removeprefix(robot_of(env_id)).removesuffix("-v1")])
+    (x0, y0), (x1, y1) = free.min(axis=0) - 1, free.max(axis=0) + 1
+    assert len(walls) + len(free) == (x1 - x0 + 1) * (y1 - y0 + 1)
+    cells = {(round(x), round(y)) for x, y in walls / side} | {(x, y) for x, y in free.tolist()}
+    assert cells == {(x, y) for x in range(x0, x1 + 1) for y in range(y0, y1 + 1)}
+    big = {"AntUMaze-v1": 8, "AntPush-v1": 8, "AntPushMaze-v1": 2, "PointPushMaze-v1": 6}
+    assert side == big.get(env_id, 4) and height == side / 2
+
+
+@pytest.mark.filterwarnings("ignore")  # it recommends other bounds than the original's
+@pytest.mark.parametrize("env_id", TASKS)
+def test_spaces_and_gymnasium_checks(env_id):
+    obs_dim, high, goal, dt, _ = TASKS[env_id]
+    env = make(env_id)
+    check_env(env, skip_render_check=True)
+    assert gym.spec(env_id).max_episode_steps == 1000
+    np.testing.assert_array_equal(env.action_space.high, np.float32(high))
+    np.testing.assert_array_equal(env.action_space.low, -np.float32(high))
+    assert env.action_space.dtype == np.float32
+    assert env.observation_space == gym.spaces.Box(-np.inf, np.inf, (obs_dim,), np.float64)
+    assert env.goal == goal and env.dt == pytest.approx(dt)
+    assert env.metadata["render_fps"] == round(1 / dt)
+    with pytest.raises(ValueError, match="no maze task for robot 'swimmer' in maze 'Push'; there are ant in UMaze"):
+        MazeEnv("swimmer", "Push")
+
+
+def test_vector_environments():
+    for mode in ("sync", "async"):
+        envs = gym.make_vec("PointPush-v1", num_envs=2, vectorization_mode=mode)
+        obs, _ = envs.reset(seed=3)
+        infos = envs.step(envs.action_space.sample())[4]
+        envs.close()
+        assert obs.shape == (2, 10) and list(infos["success"]) == [False, False]
+        np.testing.assert_array_equal(obs[1], make("PointPush-v1").reset(seed=4)[0])
+
+
+@pytest.mark.parametrize("env_id", ["PointPushMaze-v1", "Swimmer4Rooms-v1"])
+def test_episode_is_truncated_after_1000_steps(env_id):
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for step in range(1, 1001):
+        obs, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        assert obs[-1] == 0.001 * step and not terminated and truncated == (step == 1000)
+
+
+# --- Reset, observation, reward
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_reset_ranges(env_id):
+    robot, blocks = robot_of(env_id), TASKS[env_id][4]
+    nq, nv = SIZES[robot]
+    env = make(env_id)
+    obs = np.array([env.reset(seed=i)[0] for i in range(300)])
+    n_block = 3 * len(blocks)
+    coordinates = np.concatenate([obs[:, :3], obs[:, 3 + n_block : nq + n_block]], axis=1) - QPOS0[robot]
+    assert (abs(coordinates).max(axis=0) <= 0.1).all() and (abs(coordinates).max(axis=0) > 0.095).all()
+    np.testing.assert_allclose(coordinates.std(axis=0), 0.2 / math.sqrt(12), rtol=0.15)
+    velocities = obs[:, nq + n_block : -1]
+    assert velocities.shape == (300, nv) and (obs[:, -1] == 0).all()
+    if robot == "Swimmer":
+        assert abs(velocities).max() <= 0.1
+        np.testing.assert_allclose(velocities.std(axis=0), 0.2 / math.sqrt(12), rtol=0.15)
+    else:
+        assert abs(velocities).max() > 0.25
+        np.testing.assert_allclose(velocities.std(axis=0), 0.1, rtol=0.2)
+    side = {"PointPush-v1": 4, "PointPushMaze-v1": 6, "AntPush-v1": 8, "AntPushMaze-v1": 2}.get(env_id)
+    home = [(x, y, side / 4) for x, y in blocks]
+    np.testing.assert_array_equal(obs[:, 3 : 3 + n_block], np.tile(np.ravel(home), (300, 1)))
+    assert not env.data.qvel[nv:].any()
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_observation_layout_and_reward(env_id):
+    _, high, _, dt, blocks = TASKS[env_id]
+    nq, nv = SIZES[robot_of(env_id)]
+    env = make(env_id)
+    before, _ = env.reset(seed=1)
+    rng = np.random.default_rng(1)
+    for step in range(1, 20):
+        action = rng.uniform(-1, 1, len(high)) * high
+        obs, reward, terminated, truncated, info = env.step(action)
+        positions = [env.data.qpos[nq + 2 * i : nq + 2 * i + 2] + blocks[i] for i in range(len(blocks))]
+        heights = [env.model.body(env.model.nbody - 1).pos[2]] * len(blocks)
+        blocks_xyz = np.ravel([[*xy, z] for xy, z in zip(positions, heights, strict=True)])
+        q, v = env.data.qpos, env.data.qvel
+        np.testing.assert_allclose(obs, [*q[:3], *blocks_xyz, *q[3:nq], *v[:nv], 0.001 * step], atol=1e-12)
+        speed = math.dist(obs[:2], before[:2]) / dt
+        inner = 0 if env_id.startswith("Point") else speed - 1e-4 * sum(a * a for a in action)
+        assert reward == pytest.approx(-0.0001 + 0.01 * inner, rel=1e-9)
+        assert (terminated, truncated, info) == (False, False, {"success": False})
+        before = obs
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in TASKS if "PushMaze" not in env_id])
+def test_goal_ends_the_episode(env_id):
+    _, high, goal, _, _ = TASKS[env_id]
+    env = make(env_id)
+    slack = 1e-6 if env_id.startswith("Point") else 0.05  # what the robot moves in the step
+    for distance, reached in ((0.6 - slack, True), (0.6 + slack, False)):
+        place(env, goal[0] - 0.6 * distance, goal[1] - 0.8 * distance)
+        obs, reward, terminated, truncated, info = env.step(np.zeros(len(high)))
+        assert (math.dist(obs[:2], goal) <= 0.6) == reached == terminated == info["success"]
+        assert not truncated and reward == pytest.approx(1 if reached else -0.0001, abs=0.01)
+        if env_id.startswith("Point"):
+            assert reward == (1 if reached else -0.0001)
+
+
+def test_goal_is_an_argument_because_the_one_of_pushmaze_is_in_the_wall():
+    for env_id in ("PointPushMaze-v1", "AntPushMaze-v1"):
+        walls, side, _ = walls_of(env_id)
+        goal = TASKS[env_id][2]
+        assert (abs(walls - goal).max(axis=1) < 1e-9).any()  # the center of a wall's cell
+        assert side / 2 > 0.6  # the whole disk that counts as the goal is inside the wall
+    env = make("PointPushMaze-v1", goal=(-6, 0.0))
+    place(env, -5.5, 0)
+    assert env.step(np.zeros(2))[1:3] == (1.0, True)
+    assert env.model.site("goal").pos[:2].tolist() == [-6, 0]
+
+
+@pytest.mark.parametrize("env_id", ["PointPushMaze-v1", "AntPush-v1", "AntUMaze-v1", "SwimmerUMaze-v1"])
+def test_trajectories_depend_on_seed_and_actions_only(env_id):
+    def trajectory(env, seed):
+        env.reset(seed=seed)
+        rng = np.random.default_rng(0)
+        high = env.action_space.high
+        steps = [env.step(rng.uniform(-high, high))[:2] for _ in range(60)]
+        second_episode, _ = env.reset()
+        return np.array([[*obs, reward] for obs, reward in steps]), second_episode
+
+    used = make(env_id)
+    first, second_episode = trajectory(used, 7)
+    for env in (used, make(env_id)):
+        again, second_again = trajectory(env, 7)
+        assert first.tobytes() == again.tobytes() and second_episode.tobytes() == second_again.tobytes()
+    assert abs(trajectory(used, 8)[0] - first).max() > 0.01
+    assert abs(second_episode - used.reset(seed=7)[0]).max() > 0.01
+
+
+# --- Robots
+
+
+def test_ant_actions_are_clipped_at_30():
+    env = make("AntUMaze-v1")
+    steps = {}
+    for high in (29, 30, 31, 1e6):
+        env.reset(seed=0)
+        obs, reward, *_ = env.step(high * np.array([1, -1] * 4))
+        steps[high] = [*obs, reward]
+    assert steps[30] == steps[31] == steps[1e6] != steps[29]
+
+
+def test_model_parameters():
+    ant, point, swimmer = (make(f"{robot}UMaze-v1").model for robot in ("Ant", "Point", "Swimmer"))
+    assert (ant.opt.timestep, point.opt.timestep, swimmer.opt.timestep) == (0.02, 0.02, 0.01)
+    assert all(m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 for m in (ant, point, swimmer))
+    assert swimmer.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+    assert (ant.actuator_gear[:, 0] == 1).all() and (swimmer.actuator_gear[:, 0] == 150).all()
+    assert (ant.geom_solimp[:, :3] == [0.8, 0.8, 0.01]).all() and (ant.geom_solref == [0.02, 1]).all()
+    with_blocks = make("AntPush-v1").model
+    assert (with_blocks.geom_solimp[:, :3] == [0.995, 0.995, 0.01]).all()
+    for model, others in ((point, [0.9, 0.95, 0.001]), (make("PointPush-v1").model, [0.995, 0.995, 0.01])):
+        robot = model.geom_bodyid == model.body("torso").id
+        assert robot.sum() == 2 and (model.geom_solimp[robot, :3] == [0.9, 0.99, 0.001]).all()
+        assert (model.geom_solimp[~robot, :3] == others).all()
+    block = with_blocks.body(with_blocks.nbody - 1)
+    assert block.mass == 0.0002 and with_blocks.geom(with_blocks.ngeom - 1).size.tolist() == [4, 4, 2]
+    joints = [with_blocks.joint(with_blocks.njnt - 2), with_blocks.joint(with_blocks.njnt - 1)]
+    assert [j.axis.tolist() for j in joints] == [[1, 0, 0], [0, 1, 0]]
+    for joint in joints:
+        assert joint.type == mujoco.mjtJoint.mjJNT_SLIDE and joint.limited == 0 and joint.margin == 0.01
+        assert joint.armature == 0 and not joint.damping.any()
+
+
+def capsule_inertia(density, r, length, old):
+    """Mass and moments about the axis and across it: of a cylinder of height length + r (old), or exact."""
+    if old:
+        h = length + r
+        mass = density * math.pi * r**2 * h
+        return mass, mass * r**2 / 2, mass * (3 * r**2 + h**2) / 12
+    cylinder, balls = density * math.pi * r**2 * length, density * math.pi * r**3 * 4 / 3
+    axis = cylinder * r**2 / 2 + balls * 2 * r**2 / 5
+    across = cylinder * (length**2 / 12 + r**2 / 4) + balls * (2 * r**2 / 5 + length**2 / 4 + 3 * length * r / 8)
+    return cylinder + balls, axis, across
+
+
+@pytest.mark.parametrize("old", [True, False])
+@pytest.mark.parametrize(
+    "env_id, density, r, n_capsules", [("SwimmerUMaze-v1", 1000, 0.1, 3), ("AntPush-v1", 5, 0.08, 12)]
+)
+def test_capsule_inertia(env_id, density, r, n_capsules, old):
+    model = make(env_id).model if old else make(env_id, old_capsule_inertia=False).model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    capsules = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)
+    assert len(capsules) == n_capsules
+    for geom in capsules:
+        body = model.geom_bodyid[geom]
+        length = 2 * model.geom_size[geom, 1]
+        assert round(length, 6) in (1, round(0.2 * math.sqrt(2), 6), round(0.4 * math.sqrt(2), 6))
+        mass, about, across = capsule_inertia(density, r, length, old)
+        assert model.body_mass[body] == pytest.approx(mass, rel=1e-9)
+        axis = data.geom_xmat[geom].reshape(3, 3)[:, 2]  # a capsule lies along its own z
+        frame = data.ximat[body].reshape(3, 3)
+        tensor = frame @ np.diag(model.body_inertia[body]) @ frame.T
+        expected = across * np.eye(3) + (about - across) * np.outer(axis, axis)
+        np.testing.assert_allclose(tensor, expected, atol=1e-9 * across)
+    assert model.body_subtreemass[0] == pytest.approx(model.body_mass.sum(), rel=1e-9)  # mj_setConst ran
+    if env_id.startswith("Ant"):
+        assert model.body("torso").mass == pytest.approx(5 * 4 / 3 * math.pi * 0.25**3, rel=1e-9)
+
+
+@pytest.mark.parametrize("robot", ["Ant", "Swimmer"])
+def test_walls_stop_the_ant_but_not_the_swimmer(robot):
+    env = make(f"{robot}4Rooms-v1")
+    place(env, 0, 0)
+    xs = []
+    for _ in range(60):
+        env.data.qvel[0] = -4  # m/s, towards a wall that begins at x = -2
+        xs.append(env.step(np.zeros(env.model.nu))[0][0])
+    if robot == "Ant":  # its torso, a ball of radius 0.25, touches the wall
+        assert -1.85 < min(xs) < -1.7
+    else:
+        assert min(xs) < -6
+
+
+def test_point_turns_first_then_moves_and_wraps_its_heading():
+    env = make("PointUMaze-v1")
+    place(env, 0, 0)
+    env.data.qpos[2] = 3.1
+    obs = env.step([0.5, 0.2])[0]
+    heading = 3.1 + 0.2 - 2 * math.pi
+    np.testing.assert_allclose(obs[:3], [0.5 * math.cos(heading), 0.5 * math.sin(heading), heading], atol=1e-9)
+    place(env, 0, 0)
+    env.data.qpos[2] = -3.1
+    assert env.step([0, -7])[0][2] == pytest.approx(-3.1 - 0.25 + 2 * math.pi)  # clipped to 0.25
+    place(env, 0, 0, v0=100)  # velocities are clipped to 10 before a step of 0.02
+    assert env.step([0, 0])[0][0] == pytest.approx(0.2)
+
+
+# In PointUMaze a cell is 4 wide. The robot's cell has faces at x = -1.6, y = -1.6 and y = 1.6 (walls at 2, less 0.4);
+# the wall in the middle ends at x = 6 and y = 2, its faces at x = 6.4 and y = 1.6.
+REFLECTIONS = {
+    "free": ((0, 0), (0.9, 0.3), (0.9, 0.3)),
+    "head-on": ((-1, 0), (-2, 0), (-1.28, 0)),  # 0.4 is left at the face; 0.8 of it goes back
+    "oblique": ((-1.2, 0), (-2, 0.5), (-1.28, 0.45)),  # meets the face at (-1.6, 0.25); 0.4 and 0.25 are left
+    "oblique, other axis": ((0, 1.2), (0.6, 2), (0.54, 1.28)),  # at (0.3, 1.6); 0.3 and 0.4 are left
+    "outer corner": ((6.2, 1.4), (6.5, 2.2), (6.455, 1.12)),  # at (6.275, 1.6), before x = 6.4; 0.225 and 0.6 are left
+    "past the outer corner": ((6.5, 1.4), (6.5, 2.4), (6.5, 2.4)),
+    "inner corner": ((-1.3, -1.5), (-1.8, -1.55), (-1.44, -1.546)),  # at (-1.6, -1.53); 0.2 and 0.02 are left
+    "blocked twice": ((-1.5, -1.5), (-2, -1.8), (-1.5, -1.5)),  # reflected at x = -1.6, the rest crosses y = -1.6
+}
+
+
+@pytest.mark.parametrize("case", REFLECTIONS)
+def test_reflection_at_walls(case):
+    start, end, expected = REFLECTIONS[case]
+    env = make("PointUMaze-v1")
+    np.testing.assert_allclose(env.reflect(start, end), expected, atol=1e-12)
+    env.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # or the walls would push the body meanwhile
+    place(env, *start)
+    env.data.qpos[2] = heading = math.atan2(end[1] - start[1], end[0] - start[0])
+    np.testing.assert_allclose(env.step([math.dist(start, end), 0])[0][:3], [*expected, heading], atol=1e-12)
+
+
+def test_moves_on_a_face():
+    reflect = make("PointUMaze-v1").reflect
+    assert reflect((-1.6, 0), (-1.6, 0.5)) == (-1.6, 0.5)  # along it: free
+    assert reflect((-1, 0), (-1.6, 0)) == (-1, 0)  # onto it: reflected to where it arrived, which is again on a face
+
+
+def test_reflection_faces_of_a_single_wall():
+    """A lone wall, side 2, at the origin of its grid's center has four faces at 1.4 from its center, which meet."""
+    cells = read_grid("... .#. R..", 2)  # the wall is at (2, -2)
+    faces = sorted(WallReflection(cells, 2).faces)
+    expected = [(0, 0.6, -3.4, -0.6), (0, 3.4, -3.4, -0.6), (1, -3.4, 0.6, 3.4), (1, -0.6, 0.6, 3.4)]
+    np.testing.assert_allclose(faces, expected)
+
+
+@pytest.mark.parametrize("env_id", POINT_MAZES)
+def test_walls_stop_the_point(env_id):
+    walls, side, _ = walls_of(env_id)
+    env = make(env_id)
+    rng = np.random.default_rng(0)
+    stopped = 0
+    for episode in range(3):
+        xy = env.reset(seed=episode)[0][:2]
+        turn = 0
+        for _ in range(600):
+            turn = 0.9 * turn + 0.05 * rng.standard_normal()
+            last, xy = xy, env.step([1, turn])[0][:2]
+            assert (abs(xy - walls).max(axis=1) >= side / 2 + 0.4 - 1e-9).all()
+            stopped += math.dist(last, xy) < 0.5
+    assert stopped > 100
+
+
+# --- Blocks
+
+
+def test_point_pushes_the_block():
+    env = make("PointPush-v1")
+    place(env, 0, 0)
+    env.data.qpos[2] = math.pi / 2
+    obs = np.array([env.step([0.05, 0])[0] for _ in range(80)])
+    x, y, z = obs[:, 3:6].T
+    assert y[0] == pytest.approx(4) and y[-1] > 6 and (np.diff(y) > -1e-9).all()
+    assert (y - obs[:, 1] > 2).all()  # the point stays before the block
+    assert y[-1] == pytest.approx(4 + env.data.qpos[4]) and abs(x).max() < 0.01 and (z == 1).all()
+
+
+def test_ant_pushes_the_block():
+    env = make("AntPush-v1")
+    place(env, 0, 2.5, v1=2)  # the block's face is at y = 4
+    for _ in range(40):
+        env.data.qvel[1] = 2
+        obs = env.step(np.zeros(8))[0]
+    assert obs[4] > 8.3 and obs[4] == pytest.approx(8 + env.data.qpos[16]) and abs(obs[3]) < 1 and obs[5] == 2
+    assert obs[4] - obs[1] > 4  # it has not gone into the block
+
+
+# --- Rendering
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_picture_shows_robot_goal_and_walls(env_id):
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=0)
+    image = env.render().astype(int)
+    env.close()
+    assert image.shape == (480, 480, 3)
+    r, g, b = image.transpose(2, 0, 1)
+    assert ((r > b + 90) & (g > b + 25) & (r > g + 40)).sum() > 40  # the robot, orange
+    assert ((g > r + 60) & (g > b + 60)).sum() > 40  # the goal, green
+    assert ((b > r + 25) & (b > g + 10)).sum() > 20000  # the walls, blue-gray
+    red = ((r > g + 100) & (r > b + 100)).sum()
+    assert (red > 5000) == ("Push" in env_id)  # the blocks
+    assert make(env_id).render() is None
