@@ -255,6 +255,7 @@ def test_whole_rollout_against_sb3(monkeypatch, tmp_path, bootstrap):
         sb3.collect_rollouts(sb3.env, callback, sb3.rollout_buffer, N_STEPS)
         buffer = sb3.rollout_buffer
         assert buffer.episode_starts.sum() > N_ENVS
+        assert {x.dtype for x in (obs, actions, logprobs, advantages, returns)} == {torch.float32}  # as compiled
         for ours, their in [(obs, buffer.observations), (actions, buffer.actions), (logprobs, buffer.log_probs),
                             (advantages, buffer.advantages), (returns, buffer.returns)]:  # fmt: skip
             np.testing.assert_allclose(ours.numpy(), their.reshape(ours.shape), rtol=1e-3, atol=1e-4)
