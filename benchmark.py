@@ -1,0 +1,319 @@
+"""How long a training step takes, and what it is made of: this script beside other ways to run the same protocol.
+
+    pip install -r requirements.txt -r tests/requirements.txt && python benchmark.py
+
+Every contender trains with the paper's settings (4 environments, 8,192 steps per update) and evaluates 50 episodes, in
+a process of its own, on one thread. They take turns: a round is one update and one evaluation of each. The table has
+medians over rounds in microseconds per training step, evaluations weighted as in the protocol (one per 10,240 steps).
+The first round is not counted; start-up is the time until it begins: imports, making environments, torch.compile (which
+takes longer the first time on a machine). Policies are as they are after a few updates. "files" is logging,
+evaluations.csv and checkpoints. Bare physics is the simulator alone, called from Python: as many control steps as the
+protocol has, with random actions in training and none in evaluation.
+"""
+
+import argparse
+import functools
+import multiprocessing
+import os
+import resource
+import sys
+import tempfile
+import time
+from collections import defaultdict
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+N_ENVS, N_STEPS, STEPS = 4, 2048, 8192  # environments, steps in each per update, steps per round
+EVAL_FREQ, EVAL_EPISODES = 10_240, 50
+LEARNING_RATE, GAMMA, GAE_LAMBDA, CLIP_RANGE, BATCH_SIZE, N_EPOCHS = 2.5e-4, 0.99, 0.95, 0.2, 128, 10
+PHASES = ["rollout", "noise", "update", "files", "evaluation"]
+PAPER, PHYSICS = "the paper's stack", "bare physics"
+
+
+class Clock:
+    """Measures how long a contender is in each phase, and keeps it waiting between rounds."""
+
+    def __init__(self, pipe):
+        self.pipe, self.seconds = pipe, defaultdict(float)
+        self.phase, self.since = None, time.perf_counter()
+
+    def switch(self, phase):
+        """The time from here on belongs to this phase; returns the one before."""
+        now = time.perf_counter()
+        self.seconds[self.phase] += now - self.since
+        previous, self.phase, self.since = self.phase, phase, now
+        return previous
+
+    def timed(self, phase, function):
+        """The same function; its time is this phase's, and not that of the phase it is called in."""
+
+        def timed_function(*args, **kwargs):
+            previous = self.switch(phase)
+            result = function(*args, **kwargs)
+            self.switch(previous)
+            return result
+
+        return timed_function
+
+    def next_round(self):
+        """Reports the seconds since the last call and the peak memory, waits for its turn, and begins a rollout."""
+        self.switch(None)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+        self.pipe.send({**{phase: self.seconds[phase] for phase in PHASES}, "peak MB": peak})
+        if not self.pipe.recv():
+            sys.exit()
+        self.seconds.clear()
+        self.phase, self.since = "rollout", time.perf_counter()
+
+
+def run_script(clock, env_id, envpool=False, n_envs=N_ENVS, evaluations=True):
+    """ppo_colored_continuous.py itself, with timers around the functions that its phases consist of or begin with."""
+    import ppo_colored_continuous as ppo
+
+    def compute_gae(*args):  # as in Stable-Baselines3, values and log-probabilities belong to the rollout
+        clock.switch("update")
+        return original_compute_gae(*args)
+
+    def save_checkpoint(*args):  # the last thing before the next rollout
+        timed_save_checkpoint(*args)
+        clock.next_round()
+
+    ppo.silence()
+    original_compute_gae, ppo.compute_gae = ppo.compute_gae, compute_gae
+    ppo.evaluate = clock.timed("evaluation", ppo.evaluate)
+    ppo.ColoredNoiseProcess.sample = clock.timed("noise", ppo.ColoredNoiseProcess.sample)
+    ppo.RunFolder.log = clock.timed("files", ppo.RunFolder.log)
+    ppo.RunFolder.add_evaluation = clock.timed("files", ppo.RunFolder.add_evaluation)
+    timed_save_checkpoint = clock.timed("files", ppo.RunFolder.save_checkpoint)
+    ppo.RunFolder.save_checkpoint = save_checkpoint
+    with tempfile.TemporaryDirectory() as folder:
+        flags = f"--env-id {env_id} --n-envs {n_envs} --n-steps {N_STEPS} --runs-dir {folder} --total-timesteps 1e12 "
+        flags += f"--eval-freq {STEPS if evaluations else 1e12} --eval-episodes {EVAL_EPISODES if evaluations else 1}"
+        sys.argv = ["ppo_colored_continuous.py", *flags.split(), *["--envpool"] * envpool]
+        ppo.main()
+
+
+def run_paper_stack(clock, env_id):
+    """Stable-Baselines3's PPO with noise from pink-noise-rl, and its EvalCallback over 10 environments."""
+    import gymnasium as gym
+    import numpy as np
+    import shimmy  # noqa: F401  registers the dm_control ids
+    import torch
+    from pink import ColoredNoiseProcess
+    from stable_baselines3 import PPO
+    from stable_baselines3.common import callbacks
+    from stable_baselines3.common.distributions import DiagGaussianDistribution
+    from stable_baselines3.common.env_util import make_vec_env
+
+    class ColoredGaussian(DiagGaussianDistribution):
+        def __init__(self, action_dim):
+            super().__init__(action_dim)
+            self.noise = ColoredNoiseProcess(0.5, (N_ENVS, action_dim, 1000), rng=np.random.default_rng(1))
+
+        def sample(self):
+            eps = torch.as_tensor(self.noise.sample(), dtype=torch.float32)
+            return self.distribution.mean + self.distribution.stddev * eps
+
+    torch.set_num_threads(1)
+    make = functools.partial(make_vec_env, env_id, seed=1, wrapper_class=gym.wrappers.FlattenObservation)
+    settings = dict(n_steps=N_STEPS, batch_size=BATCH_SIZE, n_epochs=N_EPOCHS, learning_rate=LEARNING_RATE)
+    model = PPO("MlpPolicy", make(n_envs=N_ENVS), **settings, seed=1)
+    model.policy.action_dist = ColoredGaussian(model.action_space.shape[0])
+    model.train = clock.timed("update", model.train)
+    callbacks.evaluate_policy = clock.timed("evaluation", callbacks.evaluate_policy)
+    evaluation = callbacks.EvalCallback(make(n_envs=10), None, None, EVAL_EPISODES, eval_freq=N_STEPS, verbose=0)
+    while True:
+        clock.next_round()
+        model.learn(STEPS, evaluation, reset_num_timesteps=False)
+
+
+def run_eager(clock, env_id):
+    """PPO as CleanRL writes it: tensors step by step, autograd and Adam. Evaluated as this script does it."""
+    import numpy as np
+    import torch
+    from torch.distributions import Normal
+
+    from environments import make_vector_env
+    from ppo_colored_continuous import Agent, evaluate
+
+    envs, eval_envs = make_vector_env(env_id, N_ENVS), make_vector_env(env_id, EVAL_EPISODES)
+    obs_dim, action_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    low, high = envs.single_action_space.low, envs.single_action_space.high
+    agent = Agent(obs_dim, action_dim)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
+    obs, actions = torch.zeros(N_STEPS, N_ENVS, obs_dim), torch.zeros(N_STEPS, N_ENVS, action_dim)
+    logprobs, rewards, dones, values = (torch.zeros(N_STEPS, N_ENVS) for _ in range(4))
+
+    def get_action_and_value(x, action=None):
+        mean = agent.actor_mean(x)
+        probs = Normal(mean, agent.log_std.expand_as(mean).exp())
+        action = probs.sample() if action is None else action
+        return action, probs.log_prob(action).sum(1), probs.entropy().sum(1), agent.critic(x).view(-1)
+
+    @torch.no_grad()
+    def policy(x):
+        return np.clip(agent.actor_mean(torch.tensor(x)).numpy(), low, high)
+
+    @torch.no_grad()
+    def collect(next_obs, next_done):
+        for t in range(N_STEPS):
+            obs[t], dones[t] = next_obs, next_done
+            actions[t], logprobs[t], _, values[t] = get_action_and_value(next_obs)
+            next_obs, reward, terminated, truncated, _ = envs.step(np.clip(actions[t].numpy(), low, high))
+            next_obs, rewards[t] = torch.tensor(next_obs), torch.tensor(reward)
+            next_done = torch.tensor(terminated | truncated, dtype=torch.float32)
+        advantages, last, value, done = torch.zeros_like(rewards), 0, agent.critic(next_obs).view(-1), next_done
+        for t in reversed(range(N_STEPS)):
+            delta = rewards[t] + GAMMA * value * (1 - done) - values[t]
+            advantages[t] = last = delta + GAMMA * GAE_LAMBDA * (1 - done) * last
+            value, done = values[t], dones[t]
+        batch = [x.flatten(0, 1) for x in (obs, actions, logprobs, advantages, advantages + values)]
+        return batch, next_obs, next_done
+
+    def update(batch):
+        indices, clip_fractions = np.arange(STEPS), []
+        for _ in range(N_EPOCHS):
+            np.random.default_rng().shuffle(indices)
+            for start in range(0, STEPS, BATCH_SIZE):
+                minibatch = (x[indices[start : start + BATCH_SIZE]] for x in batch)
+                mb_obs, mb_actions, mb_logprobs, mb_advantages, mb_returns = minibatch
+                _, new_logprobs, _, new_values = get_action_and_value(mb_obs, mb_actions)
+                ratio = (new_logprobs - mb_logprobs).exp()
+                clip_fractions.append(((ratio - 1).abs() > CLIP_RANGE).float().mean().item())
+                mb_advantages = (mb_advantages - mb_advantages.mean()) / (mb_advantages.std() + 1e-8)
+                clipped_ratio = torch.clamp(ratio, 1 - CLIP_RANGE, 1 + CLIP_RANGE)
+                policy_loss = torch.max(-mb_advantages * ratio, -mb_advantages * clipped_ratio).mean()
+                optimizer.zero_grad()
+                (policy_loss + 0.5 * ((new_values - mb_returns) ** 2).mean()).backward()
+                torch.nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
+                optimizer.step()
+
+    next_obs, next_done = torch.tensor(envs.reset(seed=1)[0]), torch.zeros(N_ENVS)
+    while True:
+        clock.next_round()
+        batch, next_obs, next_done = collect(next_obs, next_done)
+        clock.timed("update", update)(batch)
+        clock.timed("evaluation", evaluate)(policy, eval_envs, 1)
+
+
+def run_physics(clock, env_id):
+    """mj_step on a dm_control task's model, with its number of substeps per control step; resets are not counted."""
+    import mujoco
+    import numpy as np
+    from dm_control import suite
+
+    if not env_id.startswith("dm_control/"):
+        raise ValueError("it knows only dm_control's models")
+    env = suite.load(*env_id.removeprefix("dm_control/").removesuffix("-v0").split("-"))
+    model, data = env.physics.model.ptr, env.physics.data.ptr
+    n_substeps, episode_length = round(env.control_timestep() / model.opt.timestep), round(env._step_limit)
+    random = np.random.default_rng(1).normal(size=(episode_length, model.nu)).clip(-1, 1)
+
+    def simulate(n_steps, actions):
+        for t in range(n_steps):
+            if t % episode_length == 0:
+                clock.timed(None, env.reset)()
+            data.ctrl[:] = actions[t % episode_length]
+            mujoco.mj_step(model, data, n_substeps)
+
+    while True:
+        clock.next_round()
+        simulate(STEPS, random)
+        clock.timed("evaluation", simulate)(EVAL_EPISODES * episode_length, 0 * random)
+
+
+def contend(pipe, run, env_id):
+    """What a contender's process does: runs, silently, and reports why where it cannot."""
+    sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    try:
+        run(Clock(pipe), env_id)
+    except Exception as error:
+        pipe.send(f"{type(error).__name__}: {error}")
+
+
+def measure(env_id, contenders, n_rounds, n_envs=N_ENVS):
+    """Lets contenders, {name: run}, play one round that is not counted (but if n_rounds is 0) and n_rounds, in turns.
+
+    Returns a list of table rows, of those that can run.
+    """
+    import pandas as pd
+
+    def receive(name):
+        result = pipes[name].recv()
+        if isinstance(result, str):
+            print(f"note: nothing of {name} on {env_id} ({result})", file=sys.stderr)
+            del pipes[name]
+        return result
+
+    context, pipes, processes, startup, rounds = multiprocessing.get_context("spawn"), {}, {}, {}, defaultdict(list)
+    for name, run in contenders.items():
+        pipes[name], pipe = context.Pipe()
+        processes[name] = context.Process(target=contend, args=(pipe, run, env_id), daemon=True)
+        start = time.perf_counter()
+        processes[name].start()
+        receive(name)
+        startup[name] = time.perf_counter() - start
+    for _ in range(1 + n_rounds):
+        for name in list(pipes):
+            pipes[name].send(True)
+            rounds[name].append(receive(name))
+    rows = []
+    for name, pipe in pipes.items():
+        pipe.send(False)
+        processes[name].join()
+        table = pd.DataFrame(rounds[name][1:] or rounds[name])
+        table[PHASES] *= 1e6 / (n_envs * N_STEPS)
+        table["evaluation"] *= STEPS / EVAL_FREQ
+        total = table[PHASES].sum(axis=1)
+        summary = {"total us": total.median(), "from": total.min(), "to": total.max(), "start-up s": startup[name]}
+        rows.append({"env_id": env_id, "contender": name, "n_envs": n_envs, **table.median(), **summary})
+    return rows
+
+
+def compare(env_id, n_rounds):
+    """All contenders on one environment. Returns the rows of the table, with the ratios of the totals."""
+    ours = {"this script, --envpool": functools.partial(run_script, envpool=True), "this script": run_script}
+    others = {PAPER: run_paper_stack, "eager PPO": run_eager, PHYSICS: run_physics}
+    rows = measure(env_id, {**ours, **others}, n_rounds)
+    totals = {row["contender"]: row["total us"] for row in rows}
+    for row in rows:
+        row["x faster"] = totals.get(PAPER, float("nan")) / row["total us"]
+        row["x physics"] = row["total us"] / totals.get(PHYSICS, float("nan"))
+    return rows
+
+
+def compare_n_envs(env_id, all_n_envs):
+    """This script's training, without evaluations, with each number of environments. Returns rows of the table."""
+    rows = []
+    for n_envs in all_n_envs:
+        for name, envpool in [("this script, --envpool", True), ("this script", False)]:
+            run = functools.partial(run_script, envpool=envpool, n_envs=n_envs, evaluations=False)
+            n_rounds = 1 if n_envs < 64 else 0  # a long round needs no other before it
+            rows += measure(env_id, {f"{name}, training": run}, n_rounds, n_envs)
+    return rows
+
+
+def main():
+    import pandas as pd
+
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    tasks = ["pendulum-swingup", "cheetah-run", "walker-run"]
+    parser.add_argument("--env-ids", nargs="+", default=[f"dm_control/{task}-v0" for task in tasks])
+    parser.add_argument("--rounds", type=int, default=3, help="rounds that count, after one that does not")
+    parser.add_argument("--n-envs", type=int, nargs="*", default=[1, 4, 16, 64, 128], help="compared on the first id")
+    parser.add_argument("--csv", default="benchmark.csv", help="file for the table")
+    args = parser.parse_args()
+
+    tables = [functools.partial(compare, env_id, args.rounds) for env_id in args.env_ids]
+    tables += [functools.partial(compare_n_envs, args.env_ids[0], args.n_envs)] if args.n_envs else []
+    rows = []
+    for make_rows in tables:
+        rows += (table := make_rows())
+        pd.DataFrame(rows).round(3).to_csv(args.csv, index=False)
+        table = pd.DataFrame(table).set_index(["env_id", "contender", "n_envs"])
+        digits = {column: "{:.2f}".format if column.startswith("x ") else "{:.1f}".format for column in table}
+        print(table.to_string(formatters=digits), end="\n\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()

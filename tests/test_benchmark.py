@@ -1,0 +1,98 @@
+"""The benchmark: its contenders do a round's work, all of a round's time is in its phases, and the table adds up."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+from conftest import ROOT
+
+from benchmark import PHASES, measure
+
+# Plays rounds that are smaller than the real ones, and prints of each: the report, the seconds it took, the car's steps
+PLAY = """
+import json, sys, time
+from gymnasium.envs.classic_control.continuous_mountain_car import Continuous_MountainCarEnv as Car
+import benchmark
+import ppo_colored_continuous as ppo
+
+class Pipe:
+    rounds = []
+    def send(self, report):
+        if self.rounds:
+            start, steps = self.rounds.pop()
+            self.rounds.append(dict(report=report, wall=time.perf_counter() - start, steps=Car.steps - steps))
+    def recv(self):
+        self.rounds.append((time.perf_counter(), Car.steps))
+        return len(self.rounds) <= 3
+
+def step(self, action):
+    Car.steps += 1
+    return car_step(self, action)
+
+car_step, Car.step, Car.steps = Car.step, step, 0
+ppo.compile_update = lambda update, example: update
+benchmark.N_STEPS, benchmark.STEPS, benchmark.EVAL_EPISODES = 64, 256, 10
+clock, car = benchmark.Clock(Pipe()), "MountainCarContinuous-v0"
+try:
+    eval(sys.argv[1])
+except SystemExit:
+    print(json.dumps(Pipe.rounds[:-1]))
+"""
+
+
+@pytest.mark.parametrize(
+    "call, steps",
+    [
+        (
+            "run_script(clock, car)",
+            256 + 10 * 999,
+        ),  # training, and evaluations, in which the car is not yet at the goal
+        ("run_script(clock, car, n_envs=2, evaluations=False)", 128),
+        ("run_script(clock, car, envpool=True)", 0),
+        ("run_paper_stack(clock, car)", 256 + 10 * 999),
+        ("run_eager(clock, car)", 256 + 10 * 999),
+        ("run_physics(clock, 'dm_control/pendulum-swingup-v0')", 0),
+    ],
+)
+def test_a_round(call, steps):
+    process = subprocess.run(
+        [sys.executable, "-c", PLAY, "benchmark." + call], cwd=ROOT, capture_output=True, text=True
+    )
+    assert process.returncode == 0, process.stderr
+    rounds = json.loads(process.stdout)
+    assert len(rounds) == 3
+    phases = {"rollout", "update", "evaluation"} | ({"noise", "files"} if "script" in call else set())
+    phases -= {"update"} if "physics" in call else {"evaluation"} if "evaluations=False" in call else set()
+    for one in rounds:
+        assert one["steps"] == steps
+        assert {phase for phase in PHASES if one["report"][phase] > 0} == phases
+        if "physics" not in call:  # which leaves its resets out
+            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(one["wall"], rel=0.02)
+
+
+def slow_then_fast(clock, env_id):
+    """A contender that takes 10, 20, 30, 40 ms for its updates, and a tenth of that for the rest."""
+    for ms in (10, 20, 30, 40):
+        clock.next_round()
+        clock.seconds.update(rollout=ms / 1e4, update=ms / 1e3, evaluation=ms / 1e4)
+        clock.since = time.perf_counter() + 1e-9
+    clock.next_round()
+
+
+def broken(clock, env_id):
+    raise ValueError(f"cannot run {env_id}")
+
+
+def test_table(capsys):
+    rows = measure("some-env", {"fake": slow_then_fast, "broken": broken}, n_rounds=3)
+    assert [row["contender"] for row in rows] == ["fake"]
+    (row,) = rows
+    ms_per_step = 1e3 / 8192  # of a round of a millisecond, in us per step
+    assert row["update"] == pytest.approx(30 * ms_per_step, rel=1e-3)  # the median of 20, 30, 40
+    assert row["evaluation"] == pytest.approx(3 * ms_per_step * 8192 / 10240, rel=1e-3)
+    assert row["total us"] == pytest.approx((30 + 3 + 3 * 0.8) * ms_per_step, rel=1e-2)
+    assert row["from"] == pytest.approx(row["total us"] * 2 / 3, rel=1e-2)
+    assert row["peak MB"] > 5 and row["start-up s"] > 0
+    assert "cannot run some-env" in capsys.readouterr().err
