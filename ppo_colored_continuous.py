@@ -268,8 +268,10 @@ def main():
     def to_tensor(array):
         return torch.as_tensor(array, device=args.device)
 
-    def mean_action(obs):  # (n, obs_dim) -> (n, action_dim)
-        return agent.actor_mean(to_tensor(obs)).cpu().numpy()
+    def mean_action(obs):  # (n, obs_dim) -> (n, action_dim); numpy takes a fourth of torch's time for so few rows
+        for weight, bias in actor_layers[:-1]:
+            obs = np.tanh(obs @ weight.T + bias)
+        return obs @ actor_layers[-1][0].T + actor_layers[-1][1]
 
     def to_env(actions):  # (n, action_dim) -> (n, *shape of the action space), clipped to its bounds
         return np.clip(actions, low, high).reshape(-1, *action_space.shape)
@@ -298,6 +300,8 @@ def main():
 
     with tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True, mininterval=interval) as bar:
         while True:
+            actor_layers = [[p.cpu().numpy() for p in layer.parameters()] for layer in agent.actor_mean[::2]]
+
             # Evaluate at every multiple of eval_freq at which this policy is the one that acts
             while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
                 seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)

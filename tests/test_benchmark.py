@@ -49,8 +49,7 @@ except SystemExit:
             "run_script(clock, car)",
             256 + 10 * 999,
         ),  # training, and evaluations, in which the car is not yet at the goal
-        ("run_script(clock, car, n_envs=2, evaluations=False)", 128),
-        ("run_script(clock, car, envpool=True)", 0),
+        ("run_script(clock, car, envpool=True, n_envs=2, evaluations=False)", 0),
         ("run_paper_stack(clock, car)", 256 + 10 * 999),
         ("run_eager(clock, car)", 256 + 10 * 999),
         ("run_physics(clock, 'dm_control/pendulum-swingup-v0')", 0),
@@ -69,7 +68,7 @@ def test_a_round(call, steps):
         assert one["steps"] == steps
         assert {phase for phase in PHASES if one["report"][phase] > 0} == phases
         if "physics" not in call:  # which leaves its resets out
-            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(one["wall"], rel=0.02)
+            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(one["wall"], rel=0.02, abs=0.01)
 
 
 def slow_then_fast(clock, env_id):
