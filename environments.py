@@ -191,8 +191,8 @@ def make_render_env(env_id):
         os.environ.setdefault("MUJOCO_GL", "egl")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains on machines without sound
+    env = make_env(env_id, render_mode="rgb_array")
     try:
-        env = make_env(env_id, render_mode="rgb_array")
         env.reset()
         env.render()
     except Exception as error:  # each renderer fails in its own way

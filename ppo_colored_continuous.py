@@ -237,6 +237,7 @@ def make_seeds(n, *key):
 
 def main():
     args = parse_args()
+    video_env = make_render_env(args.env_id) if args.capture_video else None  # first, as it chooses MuJoCo's renderer
     envs = make_vector_env(args.env_id, args.n_envs, args.envpool)
     obs_dim, action_space = envs.single_observation_space.shape[0], envs.single_action_space
     action_dim = int(np.prod(action_space.shape))
@@ -248,7 +249,6 @@ def main():
         print(f"complete: final return {run.summary['final_return']:.4g} in {run.path} (--overwrite runs it again)")
         return
     eval_envs = make_vector_env(args.env_id, args.eval_episodes, args.envpool)
-    video_env = make_render_env(args.env_id) if args.capture_video else None
 
     init_seed, noise_seed = make_seeds(2, args.seed, 0)
     torch.manual_seed(init_seed)
