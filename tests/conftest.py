@@ -4,6 +4,8 @@ import sys
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
+if not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # before any test file imports a package that chooses a renderer
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
@@ -19,9 +21,8 @@ def train(tmp_path):
 
     def run(flags="", env=None, timeout=120):
         command = [sys.executable, str(SCRIPT), "--runs-dir", str(tmp_path / "runs"), *flags.split()]
-        return subprocess.run(
-            command, capture_output=True, text=True, env={**os.environ, **(env or {})}, timeout=timeout
-        )
+        variables = {k: v for k, v in {**os.environ, **(env or {})}.items() if v is not None}
+        return subprocess.run(command, capture_output=True, text=True, env=variables, timeout=timeout)
 
     return run
 
