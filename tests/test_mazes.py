@@ -1,9 +1,6 @@
 """The mazes against figures worked out by hand from the original's rules."""
 
 import math
-import os
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
 
 import gymnasium as gym
 import mujoco
