@@ -204,8 +204,10 @@ def make_update(agent, args):
 def compile_update(update, example):
     """Compiles `update` and tries it on example arguments; returns it as it is, with a notice, where that fails."""
     try:
-        # cpp_wrapper calls the kernels from C++ instead of Python: 13 % less time in an update
-        compiled = torch.compile(update, fullgraph=True, dynamic=False, options={"cpp_wrapper": True})
+        # cpp_wrapper calls the kernels from C++ instead of Python: 13 % less time in an update. Without the guards on
+        # everything but tensors it is another 12 %; compiled code is then not to be shared with other updates.
+        options = {"cpp_wrapper": True, "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe}
+        compiled = torch.compile(update, fullgraph=True, dynamic=False, isolate_recompiles=True, options=options)
         compiled(*example)
         return compiled
     except Exception as error:  # no compiler, no Python headers, an unsupported platform, ...
@@ -270,8 +272,8 @@ def main():
 
     def mean_action(obs):  # (n, obs_dim) -> (n, action_dim); numpy takes a fourth of torch's time for so few rows
         for weight, bias in actor_layers[:-1]:
-            obs = np.tanh(obs @ weight.T + bias)
-        return obs @ actor_layers[-1][0].T + actor_layers[-1][1]
+            obs = np.tanh(obs @ weight + bias)
+        return obs @ actor_layers[-1][0] + actor_layers[-1][1]
 
     def to_env(actions):  # (n, action_dim) -> (n, *shape of the action space), clipped to its bounds
         return np.clip(actions, low, high).reshape(-1, *action_space.shape)
@@ -284,9 +286,8 @@ def main():
     update = make_update(agent, args)
     if args.compile:
         rows = min(args.batch_size, steps_per_update)
-        example = tuple(
-            to_tensor(np.zeros((rows, *shape), np.float32)) for shape in [(obs_dim,), (action_dim,), (), (), ()]
-        )
+        shapes = [(rows, obs_dim), (rows, action_dim), (rows,), (rows,), (rows,)]
+        example = tuple(to_tensor(np.zeros(shape, np.float32)) for shape in shapes)
         update = compile_update(update, (optimizer, example))
 
     obs = np.zeros((args.n_steps, args.n_envs, obs_dim), np.float32)
@@ -300,7 +301,7 @@ def main():
 
     with tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True, mininterval=interval) as bar:
         while True:
-            actor_layers = [[p.cpu().numpy() for p in layer.parameters()] for layer in agent.actor_mean[::2]]
+            actor_layers = [[p.cpu().numpy().T.copy() for p in layer.parameters()] for layer in agent.actor_mean[::2]]
 
             # Evaluate at every multiple of eval_freq at which this policy is the one that acts
             while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):

@@ -235,6 +235,14 @@ def test_a_reset_starts_new_episodes_once():
     assert (new[:, 1] == 0).all() and (new[:, 0] != first[:, 0]).all()
 
 
+def test_actions_of_a_wrong_shape_are_refused():
+    pool = make_vector_env("dm_control/cheetah-run-v0", 2, envpool=True)
+    pool.reset(seed=[1, 2])
+    for shape in [(1, 6), (2, 5), (2, 7)]:
+        with pytest.raises(ValueError, match="reshape"):
+            pool.step(np.zeros(shape, np.float32))
+
+
 def test_mountain_car_end_to_end(train, tmp_path):
     process = train(f"{FAST} --beta 0.5 --envpool")
     assert process.returncode == 0, process.stderr
