@@ -212,7 +212,7 @@ def compile_update(update, example):
         return compiled
     except Exception as error:  # no compiler, no Python headers, an unsupported platform, ...
         reason = str(error).strip().split("\n")[0][:120]
-        print(f"note: going on without torch.compile, about 4 times slower in the update ({reason})", file=sys.stderr)
+        print(f"note: going on without torch.compile, about 6 times slower in the update ({reason})", file=sys.stderr)
         return update
 
 
