@@ -284,11 +284,13 @@ ended() { # Run $1 ended with exit code $2
     echo "complete ($((++n_complete)) of ${#folders[@]}): $folder"
   elif [[ -n $stopping ]]; then
     return
+  elif [[ $2 == 130 ]]; then # Ctrl-C; seldom, on a busy machine, it reaches the runs and not the trap below
+    stop 130
   elif ! can_write; then
     stop 1
   elif [[ $2 =~ ^12[67]$ || $(last_line "$1") =~ No\ space\ left|[Qq]uota\ exceeded ]]; then # 127: no python here
     problem="$folder: $(last_line "$1")" && stop 1
-  elif [[ -d $folder && ! $2 =~ ^(0|3|129|130|137|143)$ ]]; then
+  elif [[ -d $folder && ! $2 =~ ^(0|3|129|137|143)$ ]]; then
     echo "$2" >"$folder/failed"
     echo "failed: $folder: $(last_line "$1")"
   elif ((tries[$1] < 5)); then # killed, its folder removed, or somebody else was faster: try again at the end

@@ -254,16 +254,17 @@ def test_two_sweeps_share_the_work(tmp_path):
     assert all("\ncomplete (" in output for output in outputs)  # each did a share
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_sweep_saves_and_tells_how_to_go_on(tmp_path, number):
+@pytest.mark.parametrize("to, number", [("all", signal.SIGINT), ("runs", signal.SIGINT), ("sweep", signal.SIGTERM)])
+def test_stopped_sweep_saves_and_tells_how_to_go_on(tmp_path, to, number):
     tiny = Tiny(tmp_path / "runs", betas="0 0.5", steps=2_048_000)
     process = tiny.start("-j", "2")
     wait_for(lambda: all(evaluations(folder) for folder in tiny.folders))
     assert tiny.status().startswith("quick: 0 of 2 done, 2 running, 0 failed, 0 to do")
-    if number == signal.SIGINT:
+    if to == "all":
         os.killpg(process.pid, number)  # Ctrl-C goes to the children as well
-    else:
-        process.send_signal(number)
+    else:  # bash can miss the Ctrl-C that ends its children
+        for pid in children(process.pid) if to == "runs" else [process.pid]:
+            os.kill(pid, number)
     output = process.communicate(timeout=60)[0]
     assert process.returncode == 128 + number
     (command,) = re.findall("^to go on: (.*)", output, re.M)
