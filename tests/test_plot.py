@@ -461,3 +461,9 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
     gray = [np.dot(plot.color(beta)[:3], [0.299, 0.587, 0.114]) for beta in np.linspace(-1, 2, 50)]
     assert (np.diff(gray) > 0).all() and gray[-1] < 0.75
     assert len({plot.look(beta)["marker"] for beta in plot.STUDY_BETAS}) == 8
+
+
+def test_the_readme_shows_the_table_of_the_data(tmp_path):
+    runs, _ = plot.select(plot.load([ROOT / "results" / "reproduction.csv"])[0])
+    plot.save_table(plot.final_returns(runs), tmp_path, "final_returns")
+    assert (tmp_path / "final_returns.md").read_text() in (ROOT / "README.md").read_text()
