@@ -463,7 +463,15 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
     assert len({plot.look(beta)["marker"] for beta in plot.STUDY_BETAS}) == 8
 
 
-def test_the_readme_shows_the_table_of_the_data(tmp_path):
-    runs, _ = plot.select(plot.load([ROOT / "results" / "reproduction.csv"])[0])
+@pytest.mark.parametrize(
+    "readme, data, n_envs",
+    [
+        ("README.md", "reproduction.csv", None),
+        ("README.md", "bootstrapped_timeouts.csv", [32]),
+        ("results/README.md", "bootstrapped_timeouts.csv", None),
+    ],
+)
+def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data, n_envs):
+    runs, _ = plot.select(plot.load([ROOT / "results" / data], n_envs=n_envs)[0])
     plot.save_table(plot.final_returns(runs), tmp_path, "final_returns")
-    assert (tmp_path / "final_returns.md").read_text() in (ROOT / "README.md").read_text()
+    assert (tmp_path / "final_returns.md").read_text() in (ROOT / readme).read_text()
