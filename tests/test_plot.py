@@ -474,4 +474,4 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
 def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data, n_envs):
     runs, _ = plot.select(plot.load([ROOT / "results" / data], n_envs=n_envs)[0])
     plot.save_table(plot.final_returns(runs), tmp_path, "final_returns")
-    assert (tmp_path / "final_returns.md").read_text() in (ROOT / readme).read_text()
+    assert (tmp_path / "final_returns.md").read_text() + "\n" in (ROOT / readme).read_text()
