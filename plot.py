@@ -9,6 +9,7 @@ Sections named below are those of Hollenstein, Martius, Piater: "Colored Noise i
 
 import argparse
 import json
+import math
 import warnings
 from pathlib import Path
 
@@ -404,8 +405,9 @@ def need(condition, what):
 
 
 def panels(count, xlabel="", ylabel="", width=2.5, height=1.9):
-    """A figure with `count` axes in rows of at most four, labelled at its left and below: figure, list of axes."""
-    rows, columns = -(-count // 4), min(count, 4)
+    """A figure with `count` axes in even rows of at most four, labelled at its left and below: figure, list of axes."""
+    rows = math.ceil(count / 4)
+    columns = math.ceil(count / rows)
     fig, axes = plt.subplots(rows, columns, figsize=(max(width * columns, 5), height * rows + 0.5), squeeze=False)
     for ax in axes.flat[count:]:
         ax.remove()
