@@ -330,6 +330,24 @@ def final_returns(runs):
     return table.assign(in_interval=holds.map({True: "yes", False: "no"})).reset_index()
 
 
+def final_return_per_beta(table):
+    """The table of `final_returns` for readers, a row per environment and n_envs, rounded like the published one.
+
+    Columns of each beta: "mean [low, high]" and the published mean, "(outside)" where our interval does not hold it.
+    """
+    rows = []
+    for key, cells in table.groupby(CELL):
+        row = dict(zip(CELL, key, strict=True)) | {"runs": cells.runs.sum()}
+        for cell in cells.to_dict("records"):
+            interval = "" if pd.isna(cell["low"]) else " [{low:z.1f}, {high:z.1f}]".format(**cell)
+            outside = " (outside)" if cell["in_interval"] == "no" else ""
+            row[f"beta {cell['beta']}"] = f"{cell['mean']:z.1f}{interval}"
+            row[f"paper, {cell['beta']}"] = "" if pd.isna(cell["paper"]) else f"{cell['paper']:z.1f}{outside}"
+        rows.append(row)
+    betas = sorted(table.beta.unique())
+    return pd.DataFrame(rows, columns=[*CELL, "runs", *(f"{of} {beta}" for beta in betas for of in ("beta", "paper,"))])
+
+
 def robust_statistics(runs):
     """Beyond the paper, because seeds are few (Agarwal et al. 2021): per beta, with 95 % bootstrap intervals,
 
@@ -760,6 +778,7 @@ def results(runs, curves):
         "best_beta_per_n_envs": (best_beta_per_n_envs, study),
         "final_return_and_performance": (final_return_and_performance, colored),
         "final_returns": (final_returns, grid),
+        "final_return_per_beta": (final_return_per_beta, "final_returns"),
         "robust_statistics": (robust_statistics, study),
         "performance_vs_beta": (compare, study, "beta"),
         "performance_vs_n_envs": (compare, study, "n_envs"),

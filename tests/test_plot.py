@@ -193,6 +193,13 @@ def test_final_return_tables(tmp_path):
     assert table["mean"].to_dict() == {"0": 677.54, "0.5": 694.66, "vanilla": 3, "1": 403.1}
     assert table.paper.to_dict() == {"0": 677.5, "0.5": 694.6, "vanilla": 733.1, "1": 403.1}
     assert table.in_interval.fillna("").to_dict() == {"0": "yes", "0.5": "no", "vanilla": "no", "1": ""}
+    wide = plot.final_return_per_beta(table.reset_index())
+    assert " ".join(wide) == "environment n_envs runs beta 0 paper, 0 beta 0.5 paper, 0.5 beta 1 paper, 1 " + (
+        "beta vanilla paper, vanilla"
+    )
+    assert wide.iloc[0].tolist() == ["Pendulum Swingup", 4, 7, "677.5 [677.5, 677.5]", "677.5"] + [
+        *["694.7 [694.7, 694.7]", "694.6 (outside)", "403.1", "403.1", "3.0 [3.0, 3.0]", "733.1 (outside)"]
+    ]
     summary = plot.final_return_and_performance(runs[~runs.vanilla]).iloc[0]
     assert summary.final_return_mean == pytest.approx((2 * 677.54 + 2 * 694.66 + 403.1) / 5)
     assert summary.performance_max == pytest.approx(347.83)
@@ -388,6 +395,7 @@ TABLES = {
     "best_beta_per_n_envs",
     "final_return_and_performance",
     "final_returns",
+    "final_return_per_beta",
     "robust_statistics",
 }
 FIGURES = {"performance_vs_beta", "performance_vs_n_envs", "n_envs_beta_grids", "beta0_vs_vanilla", "n_envs_vs_n_steps"}
@@ -464,14 +472,9 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
 
 
 @pytest.mark.parametrize(
-    "readme, data, n_envs",
-    [
-        ("README.md", "reproduction.csv", None),
-        ("README.md", "bootstrapped_timeouts.csv", [32]),
-        ("results/README.md", "bootstrapped_timeouts.csv", None),
-    ],
+    ("readme", "data"), [("README.md", "reproduction.csv"), ("results/README.md", "bootstrapped_timeouts.csv")]
 )
-def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data, n_envs):
-    runs, _ = plot.select(plot.load([ROOT / "results" / data], n_envs=n_envs)[0])
-    plot.save_table(plot.final_returns(runs), tmp_path, "final_returns")
-    assert (tmp_path / "final_returns.md").read_text() + "\n" in (ROOT / readme).read_text()
+def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data):
+    runs, _ = plot.select(plot.load([ROOT / "results" / data])[0])
+    plot.save_table(plot.final_return_per_beta(plot.final_returns(runs)), tmp_path, "table")
+    assert (tmp_path / "table.md").read_text() + "\n" in (ROOT / readme).read_text()
