@@ -15,7 +15,7 @@ PLAY = """
 import json, sys, time
 from gymnasium.envs.classic_control.continuous_mountain_car import Continuous_MountainCarEnv as Car
 import benchmark
-import ppo_colored_continuous as ppo
+import run_files
 
 class Pipe:
     rounds = []
@@ -32,7 +32,7 @@ def step(self, action):
     return car_step(self, action)
 
 car_step, Car.step, Car.steps = Car.step, step, 0
-ppo.compile_update = lambda update, example: update
+run_files.compiled = lambda update: update
 benchmark.N_STEPS, benchmark.STEPS, benchmark.EVAL_EPISODES = 64, 256, 10
 clock, car = benchmark.Clock(Pipe()), "MountainCarContinuous-v0"
 try:
@@ -49,7 +49,7 @@ except SystemExit:
             "run_script(clock, car)",
             256 + 10 * 999,
         ),  # training, and evaluations, in which the car is not yet at the goal
-        ("run_script(clock, car, envpool=True, n_envs=2, evaluations=False)", 0),
+        ("run_script(clock, car, flags='--envpool', n_envs=2, evaluations=False)", 0),
         ("run_paper_stack(clock, car)", 256 + 10 * 999),
         ("run_eager(clock, car)", 256 + 10 * 999),
         ("run_physics(clock, 'dm_control/pendulum-swingup-v0')", 0),
@@ -62,13 +62,23 @@ def test_a_round(call, steps):
     assert process.returncode == 0, process.stderr
     rounds = json.loads(process.stdout)
     assert len(rounds) == 3
-    phases = {"rollout", "update", "evaluation"} | ({"noise", "files"} if "script" in call else set())
-    phases -= {"update"} if "physics" in call else {"evaluation"} if "evaluations=False" in call else set()
+    phases = {"rollout", "update", "evaluation"} | (
+        {"noise", "files"} if "script" in call else set()
+    )
+    phases -= (
+        {"update"}
+        if "physics" in call
+        else {"evaluation"}
+        if "evaluations=False" in call
+        else set()
+    )
     for one in rounds:
         assert one["steps"] == steps
         assert {phase for phase in PHASES if one["report"][phase] > 0} == phases
         if "physics" not in call:  # which leaves its resets out
-            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(one["wall"], rel=0.02, abs=0.01)
+            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(
+                one["wall"], rel=0.02, abs=0.01
+            )
 
 
 def slow_then_fast(clock, env_id):

@@ -40,7 +40,9 @@ def test_draws_agree_with_the_closed_forms(beta, T):
     assert torch.allclose(x.var(0), marginal_variance(beta, T).expand(T), rtol=error)
     assert x.mean(1).std().item() == pytest.approx(mean_std(beta, T).item(), rel=error)
     covariance = (x[:, :1] * x).mean(0)
-    assert torch.allclose(covariance, autocovariance(beta, T), atol=error * marginal_variance(beta, T).item())
+    assert torch.allclose(
+        covariance, autocovariance(beta, T), atol=error * marginal_variance(beta, T).item()
+    )
 
 
 def test_closed_forms_have_the_published_values():
@@ -59,7 +61,12 @@ def test_agrees_with_the_colorednoise_package_in_distribution(beta, T):
     theirs = colorednoise.powerlaw_psd_gaussian(beta, (n, T), random_state=1)
     ours = draw(beta, n, T).numpy()
     # single values, steps, and sequence means: marginal, two-step correlation and the DC bin
-    for feature in (lambda x: x[:, 3], lambda x: x[:, 4] - x[:, 3], lambda x: x.mean(1), lambda x: x[:, 3] + x[:, 50]):
+    for feature in (
+        lambda x: x[:, 3],
+        lambda x: x[:, 4] - x[:, 3],
+        lambda x: x.mean(1),
+        lambda x: x[:, 3] + x[:, 50],
+    ):
         assert stats.ks_2samp(feature(ours), feature(theirs)).pvalue > 1e-3
     ours_psd, theirs_psd = (np.mean(np.abs(np.fft.rfft(x)) ** 2, axis=0) for x in (ours, theirs))
     np.testing.assert_allclose(ours_psd, theirs_psd, rtol=5 * (2 / n) ** 0.5 * 2**0.5)
@@ -75,7 +82,9 @@ def test_same_as_the_colorednoise_package_on_the_same_random_numbers(monkeypatch
             rng = np.random.default_rng(7)
             real, imaginary = (rng.normal(scale=s) / s for _ in range(2))
             normals = torch.tensor(np.stack([real, imaginary], -1), dtype=torch.float32)
-            monkeypatch.setattr(torch, "randn", lambda *size, normals=normals, **_: normals.reshape(size).clone())
+            monkeypatch.setattr(
+                torch, "randn", lambda *size, normals=normals, **_: normals.reshape(size).clone()
+            )
             ours = colored_noise(beta, (T,))
             monkeypatch.undo()
             np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=2e-5)

@@ -17,24 +17,63 @@ import plot
 
 PENDULUM, CAR, PUSH = "dm_control/pendulum-swingup-v0", "MountainCarContinuous-v0", "PointPush-v1"
 ARGS = dict(
-    **dict(total_timesteps=40, n_steps=2048, batch_size=128, n_epochs=10, learning_rate=2.5e-4, gamma=0.99),
-    **dict(noise_seq_len=1000, eval_freq=10, eval_episodes=50, bootstrap_timeouts=True, normalize_advantage=True),
-    **dict(compile=True, device="cpu", exp_name="test", runs_dir="runs", resume=False, overwrite=False, track=False),
+    **dict(
+        total_timesteps=40,
+        n_steps=2048,
+        batch_size=128,
+        n_epochs=10,
+        learning_rate=2.5e-4,
+        gamma=0.99,
+    ),
+    **dict(
+        noise_seq_len=1000,
+        eval_freq=10,
+        eval_episodes=50,
+        bootstrap_timeouts=True,
+        normalize_advantage=True,
+    ),
+    **dict(
+        compile=True,
+        device="cpu",
+        exp_name="test",
+        runs_dir="runs",
+        resume=False,
+        overwrite=False,
+        track=False,
+    ),
 )
 
 
 def write_run(root, env_id, beta, n_envs, seed, returns, **other):
     """A made-up complete run in the format of run_files.py; beta "vanilla" for --vanilla."""
     vanilla = beta == "vanilla"
-    args = {**ARGS, "env_id": env_id, "beta": [0.5 if vanilla else beta], "vanilla": vanilla, "n_envs": n_envs}
+    args = {
+        **ARGS,
+        "env_id": env_id,
+        "beta": [0.5 if vanilla else beta],
+        "vanilla": vanilla,
+        "n_envs": n_envs,
+    }
     args |= {"seed": seed, **other}
     beta = "vanilla" if vanilla else f"beta_{beta:g}"
-    folder = root / args["exp_name"] / env_id.replace("/", "_") / beta / f"n_envs_{n_envs}" / f"seed_{seed}"
+    folder = (
+        root
+        / args["exp_name"]
+        / env_id.replace("/", "_")
+        / beta
+        / f"n_envs_{n_envs}"
+        / f"seed_{seed}"
+    )
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps({"args": args, "git_commit": "abc"}))
     rows = "".join(f"{10 * (i + 1)},{x:.9g},1,200\n" for i, x in enumerate(returns))
     (folder / "evaluations.csv").write_text("step,return_mean,return_std,length_mean\n" + rows)
-    summary = {"performance": np.mean(returns), "final_return": returns[-1], "steps": 40, "wall_seconds": 1.5}
+    summary = {
+        "performance": np.mean(returns),
+        "final_return": returns[-1],
+        "steps": 40,
+        "wall_seconds": 1.5,
+    }
     (folder / "summary.json").write_text(json.dumps(summary))
     return folder
 
@@ -86,7 +125,9 @@ def test_load_gives_settings_performance_and_curves(tmp_path):
 
 def test_all_environments_of_the_paper_have_its_names():
     names = set(plot.NAMES.values())
-    assert set(plot.published("final_return_per_beta").environment) == names - {plot.NAMES[key] for key in plot.COMPLEX}
+    assert set(plot.published("final_return_per_beta").environment) == names - {
+        plot.NAMES[key] for key in plot.COMPLEX
+    }
     assert len(names) == 20
 
 
@@ -108,14 +149,25 @@ def test_intervals_are_scipys_bca():
     mean, low, high = plot.mean_interval(values)
     for column in range(3):
         ci = stats.bootstrap(
-            (values[:, column],), np.mean, method="BCa", n_resamples=9999, rng=np.random.default_rng(5)
+            (values[:, column],),
+            np.mean,
+            method="BCa",
+            n_resamples=9999,
+            rng=np.random.default_rng(5),
         ).confidence_interval
         assert mean[column] == pytest.approx(values[:, column].mean())
         width = ci.high - ci.low
-        assert abs(low[column] - ci.low) < 0.05 * width and abs(high[column] - ci.high) < 0.05 * width
+        assert (
+            abs(low[column] - ci.low) < 0.05 * width and abs(high[column] - ci.high) < 0.05 * width
+        )
         # BCa of a skewed sample is not symmetric, unlike a t interval
-        assert high[column] - mean[column] > 1.1 * (mean[column] - low[column]) or stats.skew(values[:, column]) < 0.5
-    np.testing.assert_allclose(plot.mean_interval(values[:, 1]), [mean[1], low[1], high[1]], rtol=0.02)
+        assert (
+            high[column] - mean[column] > 1.1 * (mean[column] - low[column])
+            or stats.skew(values[:, column]) < 0.5
+        )
+    np.testing.assert_allclose(
+        plot.mean_interval(values[:, 1]), [mean[1], low[1], high[1]], rtol=0.02
+    )
 
 
 @pytest.mark.filterwarnings("error")
@@ -146,24 +198,34 @@ def test_best_beta_per_env(tmp_path):
     truth = write_sweep(tmp_path, {0: 11.6, 0.2: 11, 0.5: 12, 1: 11}, n_envs=(4, 8), seeds=6)
     write_sweep(tmp_path, {0: 5, 0.5: 1}, env_id=CAR, seeds=1)
     table = plot.best_beta_per_env(select(tmp_path)).set_index("environment")
-    pooled = {beta: np.concatenate([truth[beta, n].mean(1) for n in (4, 8)]) for beta in (0, 0.2, 0.5, 1)}
+    pooled = {
+        beta: np.concatenate([truth[beta, n].mean(1) for n in (4, 8)]) for beta in (0, 0.2, 0.5, 1)
+    }
     row = table.loc["Pendulum Swingup"]
     assert row.best_beta == 0.5 == max(pooled, key=lambda beta: pooled[beta].mean())
     for beta in (0, 1):
         p = stats.ttest_ind(pooled[0.5], pooled[beta], equal_var=False).pvalue
         assert row[f"p_{beta}.0"] == pytest.approx(p, rel=1e-5)
         assert row[f"beta_{beta}.0"] == ("outperformed" if p < 0.05 else "comparable")
-    assert row[["beta_0.5", "beta_0.0", "beta_1.0"]].tolist() == ["comparable", "comparable", "outperformed"]
+    assert row[["beta_0.5", "beta_0.0", "beta_1.0"]].tolist() == [
+        "comparable",
+        "comparable",
+        "outperformed",
+    ]
     assert np.isnan(row["p_0.5"]) and 0.05 < row["p_0.0"] < 0.5
     # With one seed there is no test: only beta* itself is comparable, and beta 1 was not run.
-    assert table.loc["Mountain Car", ["best_beta", "beta_0.0", "beta_0.5", "beta_1.0"]].tolist() == [
+    assert table.loc[
+        "Mountain Car", ["best_beta", "beta_0.0", "beta_0.5", "beta_1.0"]
+    ].tolist() == [
         0,
         "comparable",
         "",
         "",
     ]
     assert table.loc["comparable in", "beta_0.5"] == "1/1"
-    assert table.loc["Pendulum Swingup", ["paper_best_beta", "paper_beta_0.5", "paper_p_0.5"]].tolist() == [
+    assert table.loc[
+        "Pendulum Swingup", ["paper_best_beta", "paper_beta_0.5", "paper_p_0.5"]
+    ].tolist() == [
         0.75,
         "comparable",
         0.92,
@@ -177,7 +239,9 @@ def test_best_beta_per_n_envs(tmp_path):
     table = plot.best_beta_per_n_envs(runs).set_index("n_envs")
     assert table.best_beta.to_dict() == {4: 0.5, 32: 1}
     z = (runs.performance - runs.performance.mean()) / runs.performance.std(ddof=0)
-    assert table.standardized_performance[32] == pytest.approx(z[(runs.n_envs == 32) & (runs.beta == 1)].mean())
+    assert table.standardized_performance[32] == pytest.approx(
+        z[(runs.n_envs == 32) & (runs.beta == 1)].mean()
+    )
     assert table.paper_best_beta.to_dict() == {4: 0.5, 32: 0.75}
 
 
@@ -192,13 +256,27 @@ def test_final_return_tables(tmp_path):
     table = plot.final_returns(runs).set_index("beta")
     assert table["mean"].to_dict() == {"0": 677.54, "0.5": 694.66, "vanilla": 3, "1": 403.1}
     assert table.paper.to_dict() == {"0": 677.5, "0.5": 694.6, "vanilla": 733.1, "1": 403.1}
-    assert table.in_interval.fillna("").to_dict() == {"0": "yes", "0.5": "no", "vanilla": "no", "1": ""}
+    assert table.in_interval.fillna("").to_dict() == {
+        "0": "yes",
+        "0.5": "no",
+        "vanilla": "no",
+        "1": "",
+    }
     wide = plot.final_return_per_beta(table.reset_index())
-    assert " ".join(wide) == "environment n_envs runs beta 0 paper, 0 beta 0.5 paper, 0.5 beta 1 paper, 1 " + (
+    assert " ".join(
+        wide
+    ) == "environment n_envs runs beta 0 paper, 0 beta 0.5 paper, 0.5 beta 1 paper, 1 " + (
         "beta vanilla paper, vanilla"
     )
     assert wide.iloc[0].tolist() == ["Pendulum Swingup", 4, 7, "677.5 [677.5, 677.5]", "677.5"] + [
-        *["694.7 [694.7, 694.7]", "694.6 (outside)", "403.1", "403.1", "3.0 [3.0, 3.0]", "733.1 (outside)"]
+        *[
+            "694.7 [694.7, 694.7]",
+            "694.6 (outside)",
+            "403.1",
+            "403.1",
+            "3.0 [3.0, 3.0]",
+            "733.1 (outside)",
+        ]
     ]
     summary = plot.final_return_and_performance(runs[~runs.vanilla]).iloc[0]
     assert summary.final_return_mean == pytest.approx((2 * 677.54 + 2 * 694.66 + 403.1) / 5)
@@ -213,11 +291,17 @@ def test_published_tables_agree():
     colored = cells[cells.beta != "vanilla"].groupby("environment").final_return_mean
     assert (colored.count() == 64).all() and len(summary) == 16
     # Cells are rounded to 0.1, so the error of a mean of 64 has a standard deviation of 0.0036; the mean to 0.01.
-    np.testing.assert_allclose(colored.mean(), summary.final_return_mean[colored.mean().index], rtol=0, atol=0.015)
+    np.testing.assert_allclose(
+        colored.mean(), summary.final_return_mean[colored.mean().index], rtol=0, atol=0.015
+    )
     everything = cells.groupby("environment").final_return_mean.mean()
     assert (everything - summary.final_return_mean).abs().max() > 1
     best = plot.published("best_beta_per_env")
-    assert [(best[f"beta_{beta}_comparable"] == "yes").sum() for beta in ("0.5", "0.0", "1.0")] == [11, 8, 7]  # Table 1
+    assert [(best[f"beta_{beta}_comparable"] == "yes").sum() for beta in ("0.5", "0.0", "1.0")] == [
+        11,
+        8,
+        7,
+    ]  # Table 1
 
 
 def test_projected_ranks_from_the_published_best_betas():
@@ -231,7 +315,12 @@ def test_projected_ranks_from_the_published_best_betas():
         # The DC bin is real with standard deviation sqrt(2) s_1; divided by T in the inverse FFT, then by sigma.
         return np.sqrt(2) * f[0] ** (-beta / 2) / T / (2 / T * np.sqrt((w**2).sum()))
 
-    assert [round(sigma(beta), 4) for beta in (0, 0.5, 1, 2)] == [0.0316, 0.1075, 0.2713, 0.5517]  # spec
+    assert [round(sigma(beta), 4) for beta in (0, 0.5, 1, 2)] == [
+        0.0316,
+        0.1075,
+        0.2713,
+        0.5517,
+    ]  # spec
     paper = plot.published("best_beta_per_n_envs").set_index("n_envs").best_beta
     assert paper.to_dict() == {1: 0.2, 2: 0.5, 4: 0.5, 8: 0.75, 16: 0.75, 32: 0.75, 64: 0.5, 128: 2}
     star = sum(sigma(beta) / n**0.5 for n, beta in paper.items()) / 8
@@ -254,7 +343,11 @@ def test_robust_statistics(tmp_path):
     u = [stats.mannwhitneyu(x, y).statistic / 64 for x, y in zip(a, b, strict=True)]
     assert table.improvement[0.5] == pytest.approx(np.mean(u))
     assert table.improvement_low[0.5] < table.improvement[0.5] < table.improvement_high[0.5] < 1
-    assert table.loc[1, ["improvement", "improvement_low", "improvement_high"]].tolist() == [1, 1, 1]
+    assert table.loc[1, ["improvement", "improvement_low", "improvement_high"]].tolist() == [
+        1,
+        1,
+        1,
+    ]
     assert np.isnan(table.improvement[0])
     # Stratified: two cells that differ widely, with nothing to choose within them, leave no uncertainty.
     constant = runs.assign(performance=runs.n_envs + runs.beta)
@@ -272,7 +365,9 @@ def test_a_mix_that_would_be_averaged_is_an_error_that_names_the_flag(tmp_path, 
     assert len(select(tmp_path / "test")) == 1  # one experiment alone is fine
     # What cannot change a result may differ, n_epochs is one of the study's own axes, and older runs lack --envpool.
     write_run(tmp_path / "fine", PENDULUM, 0.5, 4, 1, [1.0, 2.0], device="cuda", compile=False)
-    write_run(tmp_path / "fine", PENDULUM, 0.5, 4, 2, [1.0, 2.0], n_epochs=20, exp_name="c", envpool=False)
+    write_run(
+        tmp_path / "fine", PENDULUM, 0.5, 4, 2, [1.0, 2.0], n_epochs=20, exp_name="c", envpool=False
+    )
     assert len(select(tmp_path / "fine")) == 2
     write_run(tmp_path / "fine", PENDULUM, 0.5, 4, 3, [1.0, 2.0], envpool=True)
     with pytest.raises(plot.Unusable, match="--envpool"):
@@ -290,7 +385,9 @@ def test_runs_that_cannot_be_used_are_listed(tmp_path, run_plot):
     (folders[3] / "summary.json").write_text("")
     (folders[4] / "config.json").unlink()
     (folders[5] / "evaluations.csv").write_text(header + "10,inf,1,1\n")
-    (folders[5] / "summary.json").write_text('{"performance": Infinity, "final_return": Infinity, "wall_seconds": 1}')
+    (folders[5] / "summary.json").write_text(
+        '{"performance": Infinity, "final_return": Infinity, "wall_seconds": 1}'
+    )
     (folders[6] / "summary.json").unlink()
     (folders[6] / "evaluations.csv").unlink()
     (folders[7] / "evaluations.csv").write_text(header + "10,2,1,1\n")  # not what summary.json says
@@ -315,7 +412,10 @@ def test_missing_names_each_run_of_the_grid(tmp_path):
     write_sweep(tmp_path, {0: 1, 1: 1}, n_envs=(4,), seeds=3)
     write_sweep(tmp_path, {1: 1}, n_envs=(8,), seeds=2)
     lines = plot.missing(select(tmp_path))
-    assert lines == ["Pendulum Swingup, n_envs 8: beta 0, seeds 1 2 3", "Pendulum Swingup, n_envs 8: beta 1, seeds 3"]
+    assert lines == [
+        "Pendulum Swingup, n_envs 8: beta 0, seeds 1 2 3",
+        "Pendulum Swingup, n_envs 8: beta 1, seeds 3",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -342,8 +442,12 @@ def test_mistakes_give_one_line(tmp_path, monkeypatch, run_plot, arguments, word
     write_run(tmp_path / "runs", PENDULUM, 0.5, 4, 1, [1.0])
     (write_run(tmp_path / "damaged", PENDULUM, 0.5, 4, 1, [1.0]) / "config.json").write_text("")
     code, stdout, stderr = run_plot(*arguments)
-    lines = [line for line in stderr.replace("\r", "\n").splitlines() if line and "runs/s" not in line]
-    assert code in (1, 2) and len(lines) == 1 and lines[0].startswith("error: ") and words in lines[0], stderr
+    lines = [
+        line for line in stderr.replace("\r", "\n").splitlines() if line and "runs/s" not in line
+    ]
+    assert (
+        code in (1, 2) and len(lines) == 1 and lines[0].startswith("error: ") and words in lines[0]
+    ), stderr
     assert stdout == ""
 
 
@@ -372,10 +476,19 @@ def sweep(tmp_path_factory):
     """A small real sweep of everything the study varies, trained in one process by the script itself."""
     root = tmp_path_factory.mktemp("sweep")
     tiny = "--total-timesteps 64 --n-steps 16 --batch-size 16 --n-epochs 1 --eval-freq 32 --eval-episodes 1"
-    cells = [f"--n-envs {n} {beta}" for n in (1, 2) for beta in ("--beta 0", "--beta 0.5", "--vanilla")]
-    cells += ["--n-envs 2 --n-steps 32 --exp-name n_steps", "--n-envs 2 --n-epochs 2 --exp-name n_epochs"]
+    cells = [
+        f"--n-envs {n} {beta}" for n in (1, 2) for beta in ("--beta 0", "--beta 0.5", "--vanilla")
+    ]
+    cells += [
+        "--n-envs 2 --n-steps 32 --exp-name n_steps",
+        "--n-envs 2 --n-epochs 2 --exp-name n_epochs",
+    ]
     cells += [f"--env-id {PUSH} --n-envs 2 --beta 0.5"]
-    commands = [f"{tiny} --no-compile --runs-dir {root} {cell} --seed {seed}" for cell in cells for seed in (1, 2)]
+    commands = [
+        f"{tiny} --no-compile --runs-dir {root} {cell} --seed {seed}"
+        for cell in cells
+        for seed in (1, 2)
+    ]
     code = """if True:
         import runpy, sys
         script, *commands = sys.argv[1:]
@@ -384,7 +497,9 @@ def sweep(tmp_path_factory):
             sys.argv = [script, *command.split()]
             runpy.run_path(script, run_name="__main__")
     """
-    subprocess.run([sys.executable, "-c", code, str(SCRIPT), *commands], check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-c", code, str(SCRIPT), *commands], check=True, capture_output=True
+    )
     assert len(list(root.rglob("summary.json"))) == len(commands)
     return root
 
@@ -398,7 +513,13 @@ TABLES = {
     "final_return_per_beta",
     "robust_statistics",
 }
-FIGURES = {"performance_vs_beta", "performance_vs_n_envs", "n_envs_beta_grids", "beta0_vs_vanilla", "n_envs_vs_n_steps"}
+FIGURES = {
+    "performance_vs_beta",
+    "performance_vs_n_envs",
+    "n_envs_beta_grids",
+    "beta0_vs_vanilla",
+    "n_envs_vs_n_steps",
+}
 FIGURES |= {
     "n_epochs_vs_beta",
     "complex_tasks",
@@ -441,7 +562,10 @@ def test_every_figure_and_table_of_a_real_sweep(monkeypatch, tmp_path, sweep):
     runs, curves = plot.load([sweep])
     runs, left_out = plot.select(runs)
     assert left_out == []
-    assert check_figures(monkeypatch, tmp_path, plot.results(runs, curves), FIGURES | TABLES) == FIGURES
+    assert (
+        check_figures(monkeypatch, tmp_path, plot.results(runs, curves), FIGURES | TABLES)
+        == FIGURES
+    )
     for name in TABLES:
         table = pd.read_csv(tmp_path / f"{name}.csv")
         markdown = (tmp_path / f"{name}.md").read_text().splitlines()
@@ -455,7 +579,10 @@ def test_every_figure_and_table_of_a_real_sweep(monkeypatch, tmp_path, sweep):
     (tmp_path / "few").mkdir()
     made, not_made = plot.make_all(plot.results(few, curves), tmp_path / "few")
     assert {"final_returns", "learning_curves_n_envs_2", "final_return_vs_n_envs"} <= set(made)
-    assert [line.split(": needs ")[0] for line in not_made][:2] == ["performance_vs_beta", "performance_vs_n_envs"]
+    assert [line.split(": needs ")[0] for line in not_made][:2] == [
+        "performance_vs_beta",
+        "performance_vs_n_envs",
+    ]
 
 
 @pytest.mark.filterwarnings("error")
@@ -472,7 +599,8 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
 
 
 @pytest.mark.parametrize(
-    ("readme", "data"), [("README.md", "reproduction.csv"), ("results/README.md", "bootstrapped_timeouts.csv")]
+    ("readme", "data"),
+    [("README.md", "reproduction.csv"), ("results/README.md", "bootstrapped_timeouts.csv")],
 )
 def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data):
     runs, _ = plot.select(plot.load([ROOT / "results" / data])[0])
