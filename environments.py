@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import difflib
 import functools
+import importlib.util
 import io
 import logging
 import math
@@ -120,6 +121,11 @@ ENVPOOL_TASKS = {
     "dm_control/walker-run-v0": "WalkerRun-v1",
     "door-v0": "AdroitHandDoor-v1",
 }
+
+
+def envpool_has(env_id):
+    """Whether EnvPool is installed and has this task; imports nothing."""
+    return env_id in ENVPOOL_TASKS and importlib.util.find_spec("envpool") is not None
 
 
 class EnvPoolVectorEnv(VectorEnv):

@@ -25,7 +25,7 @@ from torch import nn
 
 import run_files
 from colored_noise import ColoredNoiseProcess
-from environments import make_render_env, make_vector_env, record_video, silence
+from environments import envpool_has, make_render_env, make_vector_env, record_video, silence
 from run_files import RunFolder, fail, make_seeds, stop_if_asked
 
 
@@ -39,6 +39,9 @@ def parse_args(argv=None, **defaults):
     add("--total-timesteps", type="count", default=2_048_000, help="of all environments together")
     add("--eval-freq", type="count", default=10_240, help="environment steps between evaluations")
     add("--eval-episodes", type="count", default=50, help="episodes per evaluation, in parallel")
+    add(
+        "--eval-once-per-policy", action=flag, default=False, help="do not evaluate one policy anew"
+    )
     add = parser.add_argument_group("colored noise").add_argument
     add("--beta", type="real", nargs="+", default=[0.5], help="0 white, 1 pink, 2 red; one number "
         "for all action dimensions, or one for each")  # fmt: skip
@@ -63,7 +66,8 @@ def parse_args(argv=None, **defaults):
     add("--bootstrap-timeouts", action=flag, default=True,
         help="add gamma * V(final observation) at time limits")  # fmt: skip
     add = parser.add_argument_group("running").add_argument
-    add("--envpool", action="store_true", help="environments from EnvPool, where it has them")
+    add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
+    add("--threads", type="count", default=run_files.n_cores(), help="of evaluation and EnvPool")
     add("--compile", action=flag, default=True, help="compile the update: half a minute, once")
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
     add("--exp-name", default="ppo_colored_continuous", help="the experiment, a folder's name")
@@ -79,6 +83,8 @@ def parse_args(argv=None, **defaults):
         parser.error(f"no evaluation: --eval-freq {args.eval_freq} is over --total-timesteps")
     if args.resume and args.overwrite:
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
+    if args.envpool is None:  # a run that is there keeps what it has
+        args.envpool = run_files.recorded(args, "envpool", default=envpool_has(args.env_id))
     run_files.check_device(args.device)
     return run_files.Args(**vars(args))
 
@@ -362,17 +368,18 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     with run, run_files.progress_bar(total, global_step) as bar:
         while True:
             # Evaluate at every multiple of eval_freq at which this policy is the one that acts
-            policy, is_due = run_files.numpy_policy(agent.actor_mean), False
+            policy, returns = run_files.numpy_policy(agent.actor_mean), None
             while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
-                seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
-                with run_files.preserved_generators():
-                    returns, lengths = evaluate(policy, eval_envs, seeds)
+                if returns is None or not args.eval_once_per_policy:
+                    seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
+                    with run_files.preserved_generators():
+                        returns, lengths = evaluate(policy, eval_envs, seeds)
                 run.add_evaluation(next_eval, returns, lengths)
                 bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
                 if video_env and run.is_video_due(next_eval):
                     path = run.path / "videos" / f"step_{next_eval}.mp4"
                     record_video(video_env, policy, path, seeds[0])
-                next_eval, is_due = next_eval + args.eval_freq, True
+                next_eval += args.eval_freq
             state = {
                 "global_step": global_step,
                 "next_eval": next_eval,
@@ -380,7 +387,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
             }
             state |= {"agent": agent.state_dict(), "optimizer": optimizer}
             state["torch_rng"] = torch.get_rng_state()
-            run.keep(state, write=is_due or global_step == total)
+            run.keep(state, write=returns is not None or global_step == total)
             if global_step == total:
                 break
 

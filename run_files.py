@@ -37,7 +37,8 @@ from tqdm import tqdm
 PACKAGES = ["torch", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy", "gymnasium-robotics"]
 PACKAGES += ["envpool"]
 # How a run is carried out, not what it computes: these may change between a run and its --resume.
-FREE_ARGS = {"resume", "overwrite", "runs_dir", "device", "compile", "capture_video", "track"}
+FREE_ARGS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "capture_video"}
+FREE_ARGS |= {"track"}
 SECONDS_BETWEEN_CHECKPOINTS = 5
 
 # --- The end of a program: mistakes and signals
@@ -146,6 +147,20 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def error(self, message):
         fail(f"{message} (--help lists all arguments)", code=2)
+
+
+def n_cores():
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def recorded(args, name, default):
+    """The argument's value in the config.json of the run that is there already, or the default."""
+    try:
+        config = json.loads((run_path(vars(args)) / "config.json").read_text())
+        return default if args.overwrite else config["args"].get(name, default)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+        return default  # no run, or a damaged one, of which RunFolder speaks
 
 
 def check_device(device):
