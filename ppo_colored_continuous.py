@@ -14,9 +14,14 @@ is due, collect a batch, learn from it, write it down.
 import argparse
 import math
 import os
+import sys
+import threading
 
 if __name__ == "__main__":
     os.environ["OMP_NUM_THREADS"] = "1"  # for these small networks more threads are slower
+    loading = threading.Timer(2, print, ["loading PyTorch and the environments ..."])
+    if sys.stdout.isatty():
+        loading.start()
 
 import gymnasium as gym
 import numpy as np
@@ -39,9 +44,8 @@ def parse_args(argv=None, **defaults):
     add("--total-timesteps", type="count", default=2_048_000, help="of all environments together")
     add("--eval-freq", type="count", default=10_240, help="environment steps between evaluations")
     add("--eval-episodes", type="count", default=50, help="episodes per evaluation, in parallel")
-    add(
-        "--eval-once-per-policy", action=flag, default=False, help="do not evaluate one policy anew"
-    )
+    add("--eval-once-per-policy", action=flag, default=False, help="one policy is not played anew")
+    add("--max-episode-steps", type="count", help="a time limit in place of the environment's own")
     add = parser.add_argument_group("colored noise").add_argument
     add("--beta", type="real", nargs="+", default=[0.5], help="0 white, 1 pink, 2 red; one number "
         "for all action dimensions, or one for each")  # fmt: skip
@@ -295,23 +299,25 @@ def learn(agent, optimizer, batch, learning_rate, update, args):
 # --- Evaluating
 
 
-def evaluate(policy, envs, seeds):
+def evaluate(policy, envs, seeds, max_steps=20_000):
     """Plays one episode of the policy in each environment: returns and lengths, (n_envs,) each.
 
     Returns are undiscounted. An environment whose episode has ended steps on until the longest has:
-    what it does then is not counted.
+    what it does then is not counted. Gives up where an episode takes more than max_steps.
     """
     space, (obs, _) = envs.single_action_space, envs.reset(seed=seeds)
     returns, lengths = np.zeros(envs.num_envs), np.zeros(envs.num_envs)
     running = np.ones(envs.num_envs, dtype=bool)
-    while running.any():
+    for _ in range(max_steps):
         stop_if_asked()
         actions = np.clip(policy(obs), space.low, space.high)
         obs, rewards, terminated, truncated, _ = envs.step(actions)
         returns += rewards * running
         lengths += running
         running &= ~(terminated | truncated)
-    return returns, lengths
+        if not running.any():
+            return returns, lengths
+    fail(f"no end of an episode after {max_steps} steps: --max-episode-steps N sets a time limit")
 
 
 # --- The whole run
@@ -319,7 +325,7 @@ def evaluate(policy, envs, seeds):
 
 def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=ppo_update):
     """Trains and evaluates as `args` say. The other arguments are what another method replaces."""
-    torch.set_num_threads(1)
+    run_files.prepare_torch()
     # Everything that can fail comes first, before run.start() touches anything of an earlier run
     with run_files.one_line_for(gym.error.Error):
         video_env = make_render_env(args.env_id) if args.capture_video else None
@@ -360,7 +366,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     # The state of environments cannot be saved in general: after a resume they begin new episodes
     run_files.seed_global_generators(make_seeds(2, args.seed, 3, global_step))
     obs[-1], _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
-    running = np.zeros((2, args.n_envs))
+    running, limit = np.zeros((2, args.n_envs)), args.max_episode_steps or 20_000
     steps_per_update = args.n_steps * args.n_envs
     total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
     run.start(global_step, obs_dim=obs_dim, action_dim=action_dim)
@@ -373,7 +379,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
                 if returns is None or not args.eval_once_per_policy:
                     seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
                     with run_files.preserved_generators():
-                        returns, lengths = evaluate(policy, eval_envs, seeds)
+                        returns, lengths = evaluate(policy, eval_envs, seeds, limit)
                 run.add_evaluation(next_eval, returns, lengths)
                 bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
                 if video_env and run.is_video_due(next_eval):
@@ -415,6 +421,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
 
 
 if __name__ == "__main__":
+    loading.cancel()
     silence()
     run_files.catch_signals()
     main(parse_args())

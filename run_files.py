@@ -7,6 +7,7 @@ length they had at the checkpoint, so that every evaluation and every point is t
 
 import argparse
 import contextlib
+import getpass
 import importlib.metadata
 import io
 import json
@@ -21,6 +22,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zlib
 from pathlib import Path
@@ -185,6 +187,18 @@ def seed_global_generators(seeds):
     np.random.seed(seeds[1])  # noqa: NPY002
 
 
+def prepare_torch():
+    """One thread, since more are slower for small networks; a compile cache that can be written."""
+    torch.set_num_threads(1)
+    default = f"{tempfile.gettempdir()}/torchinductor_{getpass.getuser()}"
+    folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR", default)
+    try:
+        os.makedirs(folder, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp()
+
+
 @contextlib.contextmanager
 def preserved_generators():
     """What is drawn within from the global generators is not missing from them afterwards."""
@@ -254,12 +268,15 @@ def compiled(function):
     Where that fails the function goes on as it is, with a notice; if it is at fault itself, its own
     exception comes then.
     """
-    os.environ["TORCHINDUCTOR_CACHE_DIR"] = _writable_cache()
     how = {"fullgraph": True, "dynamic": False, "isolate_recompiles": True}
     # cpp_wrapper calls the kernels from C++ instead of Python: 13 % less time in an update
     functions = [torch.compile(function, **how, options={"cpp_wrapper": True})]
+    text = "compiling the update: about 20 seconds, once per machine ..."
+    wait = [threading.Timer(2, tqdm.write, [text])] if sys.stdout.isatty() else []
 
     def call(*args):
+        if wait:
+            wait[0].start()
         try:
             return functions[0](*args)
         except Exception as error:  # no compiler, no Python headers, an unsupported platform, ...
@@ -270,21 +287,11 @@ def compiled(function):
             tqdm.write(f"note: {note} ({reason})", file=sys.stderr)
             functions[0] = function
             return function(*args)
+        finally:
+            if wait:
+                wait.pop().cancel()
 
     return call
-
-
-def _writable_cache():
-    """torch.compile's cache folder, or a temporary one where that cannot be written."""
-    try:
-        from torch._inductor.runtime.cache_dir_utils import cache_dir
-
-        folder = cache_dir()
-        os.makedirs(folder, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        return tempfile.mkdtemp()
 
 
 # --- The files of a run
