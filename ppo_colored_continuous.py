@@ -80,7 +80,7 @@ def parse_args(argv=None, **defaults):
     add("--overwrite", action="store_true", help="start again where the folder holds a run")
     add("--capture-video", action="store_true", help="of every tenth evaluation and the last")
     add("--track", action="store_true", help="log to Weights & Biases too (pip install wandb)")
-    parser.set_defaults(**defaults)
+    parser.set_defaults(**{"method": "ppo", **defaults})
     args = parser.parse_args(argv)
 
     if args.eval_freq > args.total_timesteps:

@@ -300,6 +300,7 @@ def compiled(function):
 def run_path(args):
     """Path of a run's folder: it shows the experiment, environment, beta, n_envs and seed."""
     beta = "vanilla" if args["vanilla"] else "beta_" + "_".join(f"{b:g}" for b in args["beta"])
+    beta = "gsde" if args["method"] == "gsde" else beta
     env = re.sub(r"[/:\\]", "_", args["env_id"])
     path = Path(args["runs_dir"]) / args["exp_name"] / env / beta
     return path / f"n_envs_{args['n_envs']}" / f"seed_{args['seed']}"

@@ -168,8 +168,8 @@ def test_dm_control_and_one_beta_per_action_dimension(train, tmp_path, beta):
     assert only_run(tmp_path).parts[-3] == "beta_" + beta.replace(" ", "_")
 
 
-def start(tmp_path, flags, **kwargs):
-    command = [sys.executable, SCRIPT, "--runs-dir", tmp_path / "runs", *flags.split()]
+def start(tmp_path, flags, script=SCRIPT, **kwargs):
+    command = [sys.executable, script, *flags.split(), "--runs-dir", tmp_path / "runs"]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs
     )
