@@ -1,39 +1,57 @@
-"""Vector environments by id: Gymnasium's own, and dm_control's through shimmy, with flat float32 observations.
+"""Vector environments by id: Gymnasium's own, and dm_control's through shimmy, with flat float32
+observations.
 
-Importing this file is quick and silent: the package behind an environment is imported when one is made.
+Importing this file is quick and silent: the package behind an environment is imported when one is
+made.
 """
 
 import argparse
 import contextlib
 import difflib
 import functools
+import importlib.util
 import io
 import logging
 import math
 import os
 import re
+import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
 
 
 def silence():
-    """Keeps the warnings and log lines of the packages used here off the terminal. For a program, not for a library."""
+    """Keeps the warnings and log lines of the packages used here off the terminal.
+
+    For a program, not for a library.
+    """
     gym.logger.min_level = gym.logger.ERROR + 1
     logging.getLogger("absl").setLevel(logging.ERROR)
-    warnings.showwarning = lambda *args, **kwargs: None  # filters would not do: some packages set their own
+    warnings.showwarning = lambda *args, **kwargs: None  # filters: some packages set their own
 
 
 # --- The mazes and the Adroit door
-MAZE_IDS = ["PointUMaze-v1", "Point4Rooms-v1", "AntUMaze-v1", "Ant4Rooms-v1", "SwimmerUMaze-v1", "Swimmer4Rooms-v1"]
+MAZE_IDS = [
+    "PointUMaze-v1",
+    "Point4Rooms-v1",
+    "AntUMaze-v1",
+    "Ant4Rooms-v1",
+    "SwimmerUMaze-v1",
+    "Swimmer4Rooms-v1",
+]
 MAZE_IDS += ["PointPush-v1", "AntPush-v1", "PointPushMaze-v1", "AntPushMaze-v1"]
 for env_id in MAZE_IDS:  # Gymnasium's checks of every step would cost more than the point's physics
     robot, maze = re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id).groups()
     kwargs = {"robot": robot.lower(), "maze": maze}
-    gym.register(env_id, "mazes:MazeEnv", max_episode_steps=1000, disable_env_checker=True, kwargs=kwargs)
+    gym.register(
+        env_id, "mazes:MazeEnv", max_episode_steps=1000, disable_env_checker=True, kwargs=kwargs
+    )
 gym.register("door-v0", "environments:make_door", max_episode_steps=200, disable_env_checker=True)
 
 
@@ -77,8 +95,8 @@ class FlatObservations(gym.Wrapper):
 def make_env(env_id, **kwargs):
     """Makes one environment with observations (obs_dim,) float32 and a Box action space.
 
-    Raises gymnasium.error.Error with a message for the user: unknown id (naming close matches), a package that is
-    missing, or actions that are not continuous.
+    Raises gymnasium.error.Error with a message for the user: unknown id (naming close matches), a
+    package that is missing, or actions that are not continuous.
     """
     if env_id.startswith("dm_control/"):
         import shimmy  # noqa: F401  registers the dm_control ids
@@ -88,24 +106,122 @@ def make_env(env_id, **kwargs):
         import shimmy  # noqa: F401, F811
 
         matches = difflib.get_close_matches(env_id, gym.registry, n=3, cutoff=0.4)
-        raise gym.error.UnregisteredEnv(f"unknown environment {env_id}; did you mean {' or '.join(matches)}?") from None
+        raise gym.error.UnregisteredEnv(
+            f"unknown environment {env_id}; did you mean {' or '.join(matches)}?"
+        ) from None
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled(f"{env_id} needs a package that is not installed: {error}") from error
+        raise gym.error.DependencyNotInstalled(
+            f"{env_id} needs a package that is not installed: {error}"
+        ) from error
     if not isinstance(env.action_space, spaces.Box):
-        raise gym.error.Error(f"{env_id} has actions {env.action_space}; colored noise needs continuous ones (Box)")
+        raise gym.error.Error(
+            f"{env_id} has actions {env.action_space}; colored noise needs continuous ones (Box)"
+        )
     return FlatObservations(env)
 
 
-def make_vector_env(env_id, n_envs, envpool=False):
-    """Makes n_envs environments that step together: observations (n_envs, obs_dim) float32, SAME_STEP autoreset.
+def make_vector_env(env_id, n_envs, envpool=False, threads=1, max_episode_steps=None):
+    """Makes n_envs environments that step together, with SAME_STEP autoreset.
 
-    The step that ends an episode returns the next episode's first observation, and the ended one's last observation in
-    infos["final_obs"]. Gymnasium's default, NEXT_STEP, inserts a dummy transition between episodes instead.
-    Observations are overwritten by the next step. Raises as make_env does. With envpool they are EnvPool's.
+    Observations are (n_envs, obs_dim) float32 and overwritten by the next step. The step that ends
+    an episode returns the next episode's first observation, and the ended one's last observation
+    in infos["final_obs"]. Gymnasium's default, NEXT_STEP, inserts a dummy transition between
+    episodes instead.
+
+    With envpool they are EnvPool's. Up to `threads` threads step them where that helps, with the
+    same results. max_episode_steps takes the place of the task's own time limit, if it is given.
+    Raises as make_env does.
     """
+    if envpool and max_episode_steps is not None:
+        raise gym.error.Error(
+            f"EnvPool's {env_id} has its own time limit: --max-episode-steps needs --no-envpool"
+        )
     if envpool:
-        return EnvPoolVectorEnv(env_id, n_envs)
-    return SyncVectorEnv([lambda: make_env(env_id)] * n_envs, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+        return EnvPoolVectorEnv(env_id, n_envs, threads)
+    envs = [make_env(env_id, max_episode_steps=max_episode_steps) for _ in range(n_envs)]
+    if min(threads, n_envs) > 1 and gains_by_threads(envs[0].unwrapped):
+        return ThreadedVectorEnv(envs, threads)
+    return sync_vector_env(envs)
+
+
+def gains_by_threads(env):
+    """Whether most of a step is MuJoCo's: only there may Python's other threads run meanwhile.
+
+    An environment in Python has no gain, and dm_control, whose Python takes longer than its
+    physics and whose model is not env.model, a loss.
+    """
+    mujoco = sys.modules.get("mujoco")
+    return mujoco is not None and isinstance(getattr(env, "model", None), mujoco.MjModel)
+
+
+def sync_vector_env(envs):
+    functions = [lambda env=env: env for env in envs]
+    return SyncVectorEnv(functions, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+class ThreadedVectorEnv(VectorEnv):
+    """Environments split among threads, each of which steps its part as a SyncVectorEnv.
+
+    Results equal those of one SyncVectorEnv bit for bit, if the environments share no state. What
+    an environment raises comes through with its traceback.
+    """
+
+    def __init__(self, envs, n_threads):
+        self.envs, self.num_envs = envs, len(envs)
+        n_parts = min(n_threads, len(envs))
+        self._ends = [len(envs) * i // n_parts for i in range(n_parts + 1)]
+        self._parts = [sync_vector_env(envs[i:j]) for i, j in self._slices()]
+        self._pool = ThreadPoolExecutor(n_parts - 1)  # the caller's own thread steps the first part
+        self.metadata, self.render_mode = self._parts[0].metadata, envs[0].render_mode
+        self.single_observation_space = envs[0].observation_space
+        self.single_action_space = envs[0].action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def _slices(self):
+        return zip(self._ends[:-1], self._ends[1:], strict=True)
+
+    def _each(self, calls):
+        futures = [self._pool.submit(call) for call in calls[1:]]
+        try:
+            first = calls[0]()
+        finally:
+            wait(futures)  # what comes next, be it an error, finds no environment in mid-step
+        return zip(first, *(future.result() for future in futures), strict=True)
+
+    def reset(self, *, seed=None, options=None):
+        if seed is None or isinstance(seed, int):
+            seed = [None if seed is None else seed + i for i in range(self.num_envs)]
+        seeds = [seed[i:j] for i, j in self._slices()]
+        calls = [
+            functools.partial(part.reset, seed=part_seeds, options=options)
+            for part, part_seeds in zip(self._parts, seeds, strict=True)
+        ]
+        obs, _ = self._each(calls)  # FlatObservations drops the infos
+        return np.concatenate(obs), {}
+
+    def step(self, actions):
+        calls = [
+            functools.partial(part.step, actions[i:j])
+            for part, (i, j) in zip(self._parts, self._slices(), strict=True)
+        ]
+        *arrays, parts_infos = self._each(calls)
+        infos = {}
+        for (i, j), part_infos in zip(self._slices(), parts_infos, strict=True):
+            if "final_obs" in part_infos:
+                infos.setdefault("final_obs", np.full(self.num_envs, None))
+                infos["final_obs"][i:j] = part_infos["final_obs"]
+        return *map(np.concatenate, arrays), infos
+
+    def close_extras(self, **kwargs):
+        self._pool.shutdown()
+        for part in self._parts:
+            part.close()
+
+
+def envpool_has(env_id):
+    """Whether EnvPool has this task and is installed, without importing it."""
+    return env_id in ENVPOOL_TASKS and importlib.util.find_spec("envpool") is not None
 
 
 ENVPOOL_TASKS = {
@@ -120,51 +236,75 @@ ENVPOOL_TASKS = {
     "dm_control/walker-run-v0": "WalkerRun-v1",
     "door-v0": "AdroitHandDoor-v1",
 }
+# Those that two threads step faster, at 50 environments; the others' physics is too quick for it
+GAIN_BY_THREADS = {"dm_control/cheetah-run-v0", "dm_control/walker-run-v0"}
 
 
 class EnvPoolVectorEnv(VectorEnv):
-    """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds (see reset).
+    """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds.
 
-    Raises gymnasium.error.Error, with a message for the user, for other tasks and where EnvPool is not installed.
+    Raises gymnasium.error.Error, with a message for the user, for other tasks and where EnvPool is
+    not installed.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, env_id, n_envs):
+    def __init__(self, env_id, n_envs, threads=1):
         if env_id not in ENVPOOL_TASKS:
-            raise gym.error.Error(f"--envpool does not have {env_id}, only {', '.join(ENVPOOL_TASKS)}")
+            raise gym.error.Error(
+                f"--envpool does not have {env_id}, only {', '.join(ENVPOOL_TASKS)}"
+            )
         try:
             import envpool
         except ImportError as error:
-            raise gym.error.DependencyNotInstalled(f"--envpool needs EnvPool (pip install envpool): {error}") from error
-        self._make = functools.partial(envpool.make_gymnasium, ENVPOOL_TASKS[env_id], num_envs=n_envs, num_threads=1)
+            raise gym.error.DependencyNotInstalled(
+                f"--envpool needs EnvPool (pip install envpool): {error}"
+            ) from error
+        threads = min(threads, n_envs) if env_id in GAIN_BY_THREADS else 1
+        self._make = functools.partial(
+            envpool.make_gymnasium, ENVPOOL_TASKS[env_id], num_envs=n_envs, num_threads=threads
+        )
         spec = envpool.make_spec(ENVPOOL_TASKS[env_id])
         self.env_id, self.num_envs, self._pool = env_id, n_envs, None
         obs_dim = spaces.flatdim(spec.gymnasium_observation_space)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
         action_space = spec.gymnasium_action_space
         self.single_action_space = spaces.Box(action_space.low, action_space.high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, n_envs)
+        self.action_space = batch_space(self.single_action_space, n_envs)
         self._indices, self._action_dtype = np.arange(n_envs, dtype=np.int32), action_space.dtype
-        self._state_keys = spec._state_keys  # "obs", or "obs:position" and so on; "reward", "done", "trunc"
+        self._state_keys = (
+            spec._state_keys
+        )  # "obs", or "obs:position" and so on; "reward", "done", "trunc"
         self._obs_keys = sorted(key for key in self._state_keys if key.split(":")[0] == "obs")
 
     def reset(self, *, seed=None, options=None):
-        """Starts new episodes. Only the first reset heeds the seeds, a list of n_envs integers below 2^32.
+        """Starts new episodes. Only the first reset heeds the seeds, n_envs integers below 2^32.
 
-        EnvPool takes its seeds when it is made, which takes seconds; the environments' generators run on afterwards.
+        An integer stands for seed, seed + 1 and so on, None for 0, 1 and so on. EnvPool takes its
+        seeds when it is made, which takes seconds; the environments' generators run on afterwards.
         """
         if self._pool is None:
-            seed = range(self.num_envs) if seed is None else seed
-            self._pool = self._make(seed=np.array(seed, np.uint32).view(np.int32))  # EnvPool's seeds are int32
+            if seed is None or isinstance(seed, int):
+                seed = [(seed or 0) + i for i in range(self.num_envs)]
+            self._pool = self._make(
+                seed=np.array(seed, np.uint32).view(np.int32)
+            )  # EnvPool's seeds are int32
             self._fresh = np.zeros(self.num_envs, bool)
             self._obs = np.empty((self.num_envs, *self.single_observation_space.shape), np.float32)
-        self._begin_episodes(np.flatnonzero(~self._fresh))  # the others have just been reset by step
+        self._begin_episodes(
+            np.flatnonzero(~self._fresh)
+        )  # the others have just been reset by step
         return self._obs.copy(), {}
 
     def step(self, actions):
         # The two functions that EnvPool's step() calls; the rest of it takes as long as the physics of four pendulums
-        actions = np.reshape(actions, (self.num_envs, *self.single_action_space.shape))  # or C++ reads on past the end
-        self._pool._send([self._indices, self._indices, np.asarray(actions, self._action_dtype, order="C")])
+        actions = np.reshape(
+            actions, (self.num_envs, *self.single_action_space.shape)
+        )  # or C++ reads on past the end
+        self._pool._send(
+            [self._indices, self._indices, np.asarray(actions, self._action_dtype, order="C")]
+        )
         state = self._receive()
         self._obs, rewards, truncated = state["obs"], state["reward"], state["trunc"]
         terminated = state["done"] & ~truncated
@@ -200,7 +340,9 @@ def make_render_env(env_id):
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains on machines without sound
+    os.environ.setdefault(
+        "SDL_AUDIODRIVER", "dummy"
+    )  # or pygame complains on machines without sound
     env = make_env(env_id, render_mode="rgb_array")
     try:
         env.reset()
@@ -217,7 +359,9 @@ def record_video(env, policy, path, seed):
     import imageio
 
     path.parent.mkdir(exist_ok=True)
-    fps = 1 / env.unwrapped.dt if hasattr(env.unwrapped, "dt") else env.metadata.get("render_fps", 30)
+    fps = (
+        1 / env.unwrapped.dt if hasattr(env.unwrapped, "dt") else env.metadata.get("render_fps", 30)
+    )
     obs, _ = env.reset(seed=seed)
     done = False
     with imageio.get_writer(path, fps=fps, macro_block_size=2) as video:

@@ -23,7 +23,7 @@ from test_runs import (
     wait_for_rows,
 )
 
-from environments import ENVPOOL_TASKS, make_env, make_vector_env
+from environments import ENVPOOL_TASKS, envpool_has, make_env, make_vector_env
 
 pytest.importorskip("envpool")  # has no wheels for some platforms
 
@@ -69,12 +69,22 @@ def set_state(env, obs):
             qpos[0] = math.atan2(obs[1], obs[0])
         elif domain == "cartpole":
             qpos[:] = obs[0], math.atan2(obs[2], obs[1])
-        elif domain in ("cheetah", "hopper"):  # their dynamics do not depend on the horizontal position
+        elif domain in (
+            "cheetah",
+            "hopper",
+        ):  # their dynamics do not depend on the horizontal position
             qpos[:] = 0, *obs[: len(qpos) - 1]
         elif domain == "walker":
-            angles = np.arctan2(obs[2:15:2], obs[1:15:2])  # of torso; right thigh, leg, foot; left thigh, leg, foot
+            angles = np.arctan2(
+                obs[2:15:2], obs[1:15:2]
+            )  # of torso; right thigh, leg, foot; left thigh, leg, foot
             parents = angles[[0, 1, 2, 0, 4, 5]]
-            qpos[:] = obs[0] - 1.3, 0, angles[0], *((parents - angles[1:] + np.pi) % (2 * np.pi) - np.pi)
+            qpos[:] = (
+                obs[0] - 1.3,
+                0,
+                angles[0],
+                *((parents - angles[1:] + np.pi) % (2 * np.pi) - np.pi),
+            )
         else:
             qpos[:] = obs[: len(qpos)]
     if domain == "reacher":
@@ -88,12 +98,20 @@ class Pair:
     """A task in EnvPool and in Gymnasium, and the policy's episodes in EnvPool, obs (n_steps, n_episodes, obs_dim)"""
 
     def __init__(self, env_id):
-        self.env_id, self.pool, self.env = env_id, make_vector_env(env_id, N_ENVS, envpool=True), make_env(env_id)
+        self.env_id, self.pool, self.env = (
+            env_id,
+            make_vector_env(env_id, N_ENVS, envpool=True),
+            make_env(env_id),
+        )
         self.policy = make_policy(
-            env_id, self.pool.single_observation_space.shape[0], self.pool.single_action_space.shape[0]
+            env_id,
+            self.pool.single_observation_space.shape[0],
+            self.pool.single_action_space.shape[0],
         )
         rounds = [self._play_round() for _ in range(N_ROUNDS)]
-        self.obs, self.actions, self.rewards, self.next_obs = (np.concatenate(x, axis=1) for x in zip(*rounds))  # noqa: B905
+        self.obs, self.actions, self.rewards, self.next_obs = (
+            np.concatenate(x, axis=1) for x in zip(*rounds)
+        )  # noqa: B905
 
     def _play_round(self):
         obs, _ = self.pool.reset(seed=list(range(N_ENVS)))
@@ -103,7 +121,9 @@ class Pair:
             actions, before = self.policy(obs, t), obs.copy()
             obs, rewards, terminated, truncated, infos = self.pool.step(actions)
             ended = terminated | truncated
-            steps.append((before, actions, rewards, infos["final_obs"] if ended.any() else obs.copy()))
+            steps.append(
+                (before, actions, rewards, infos["final_obs"] if ended.any() else obs.copy())
+            )
         # none of these policies reaches the car's goal, so that all episodes end together, at the time limit
         assert truncated.all() and not terminated.any()
         return [np.stack(x) for x in zip(*steps)]  # noqa: B905
@@ -122,9 +142,15 @@ def test_spaces_are_the_same(pair):
     envs = make_vector_env(pair.env_id, 1)
     assert pair.pool.single_observation_space.shape == envs.single_observation_space.shape
     for bound in ("low", "high"):
-        ours, theirs = getattr(pair.pool.single_action_space, bound), getattr(envs.single_action_space, bound)
+        ours, theirs = (
+            getattr(pair.pool.single_action_space, bound),
+            getattr(envs.single_action_space, bound),
+        )
         assert np.array_equal(ours, theirs) and ours.dtype == np.float32
-    assert pair.obs.dtype == np.float32 and pair.pool.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert (
+        pair.obs.dtype == np.float32
+        and pair.pool.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    )
     assert len(pair.obs) == {"MountainCarContinuous-v0": 999, "door-v0": 200}.get(pair.env_id, 1000)
 
 
@@ -141,7 +167,10 @@ def test_each_step_is_the_same(pair):
         sample = [(t, i) for i in range(n_episodes) for t in range(25)]
     else:
         rewarded = rng.permutation(np.argwhere(pair.rewards))[:150]
-        sample = [*rewarded, *zip(rng.integers(n_steps, size=150), rng.integers(n_episodes, size=150))]  # noqa: B905
+        sample = [
+            *rewarded,
+            *zip(rng.integers(n_steps, size=150), rng.integers(n_episodes, size=150)),
+        ]  # noqa: B905
     assert np.ptp([pair.rewards[t, i] for t, i in sample]) > 0
     pair.env.reset(seed=0)
     for t, i in sample:
@@ -177,7 +206,9 @@ def test_returns_have_the_same_distribution(pair):
     """
 
     def statistics(obs, rewards):
-        return np.concatenate([[np.sum(rewards, dtype=float)], np.mean(obs, axis=0), np.std(obs, axis=0)])
+        return np.concatenate(
+            [[np.sum(rewards, dtype=float)], np.mean(obs, axis=0), np.std(obs, axis=0)]
+        )
 
     differences = []
     for i in range(N_ENVS * N_ROUNDS):
@@ -186,19 +217,26 @@ def test_returns_have_the_same_distribution(pair):
         obs, all_obs, rewards, ended = pair.obs[0, i], [], [], False
         while not ended:
             all_obs.append(obs)
-            obs, reward, terminated, truncated, _ = pair.env.step(pair.policy(obs[None], len(rewards))[0])
+            obs, reward, terminated, truncated, _ = pair.env.step(
+                pair.policy(obs[None], len(rewards))[0]
+            )
             rewards.append(reward)
             ended = terminated or truncated
         assert truncated and len(rewards) == len(pair.rewards)
         theirs = statistics(all_obs, rewards)
         differences.append(statistics(pair.obs[:, i], pair.rewards[:, i]) - theirs)
     standard_error = np.std(differences, axis=0, ddof=1) / len(differences) ** 0.5
-    assert (np.abs(np.mean(differences, axis=0)) <= 6 * standard_error + 1e-4 * np.abs(theirs) + 1e-4).all()
+    assert (
+        np.abs(np.mean(differences, axis=0)) <= 6 * standard_error + 1e-4 * np.abs(theirs) + 1e-4
+    ).all()
 
 
 def test_ends_of_episodes():
     """Goals and time limits at different steps: the last observation is in infos, and no dummy transition follows."""
-    pool, env = make_vector_env("MountainCarContinuous-v0", 3, envpool=True), make_env("MountainCarContinuous-v0")
+    pool, env = (
+        make_vector_env("MountainCarContinuous-v0", 3, envpool=True),
+        make_env("MountainCarContinuous-v0"),
+    )
     env.reset()
     obs, _ = pool.reset(seed=[1, 2, 2**32 - 1])
     assert len(np.unique(obs[:, 0])) == 3
@@ -235,6 +273,43 @@ def test_a_reset_starts_new_episodes_once():
     assert (new[:, 1] == 0).all() and (new[:, 0] != first[:, 0]).all()
 
 
+def test_spaces_and_seeds_are_those_of_a_vector_environment():
+    pool = make_vector_env("MountainCarContinuous-v0", 3, envpool=True)
+    assert pool.observation_space.shape == (3, 2) and pool.action_space.shape == (3, 1)
+    assert pool.action_space.contains(pool.action_space.sample())
+    obs, _ = pool.reset(seed=5)
+    listed = make_vector_env("MountainCarContinuous-v0", 3, envpool=True).reset(seed=[5, 6, 7])[0]
+    np.testing.assert_array_equal(obs, listed)
+
+
+def test_threads_change_nothing():
+    def trajectory(threads):
+        pool = make_vector_env("dm_control/cheetah-run-v0", 5, envpool=True, threads=threads)
+        rng, steps = np.random.default_rng(0), [pool.reset(seed=[3, 1, 4, 1, 5])[0]]
+        for _ in range(1010):  # over the end of the episodes
+            obs, rewards, _, truncated, infos = pool.step(rng.uniform(-1, 1, (5, 6)))
+            steps += [obs.copy(), rewards, truncated, infos.get("final_obs", np.zeros(0))]
+        return b"".join(x.tobytes() for x in steps)
+
+    assert trajectory(1) == trajectory(2)
+
+
+def test_whether_envpool_has_a_task_is_known_without_importing_it(monkeypatch):
+    assert envpool_has("dm_control/cheetah-run-v0") and not envpool_has("HalfCheetah-v5")
+    code = "import sys, environments as e; assert e.envpool_has('door-v0') and 'envpool' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: None
+    )  # as if it were not installed
+    assert not envpool_has("dm_control/cheetah-run-v0")
+
+
+def test_a_time_limit_needs_the_other_environments():
+    with pytest.raises(gym.error.Error, match="--max-episode-steps needs --no-envpool"):
+        make_vector_env("MountainCarContinuous-v0", 1, envpool=True, max_episode_steps=10)
+
+
 def test_actions_of_a_wrong_shape_are_refused():
     pool = make_vector_env("dm_control/cheetah-run-v0", 2, envpool=True)
     pool.reset(seed=[1, 2])
@@ -257,7 +332,9 @@ def test_same_seed_same_evaluations_and_resume(train, tiny, tmp_path):
     process.send_signal(signal.SIGTERM)
     process.communicate()
     assert process.returncode == 143
-    done = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)["next_eval"] // 512 - 1
+    done = (
+        torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)["next_eval"] // 512 - 1
+    )
     assert done >= 3
     assert train(f"{flags} --resume").returncode == 0
     folder = only_run(tmp_path)
@@ -285,4 +362,6 @@ def test_mistakes(train, tmp_path, monkeypatch):
 
 def test_envpool_is_imported_only_when_asked_for():
     code = "import sys, environments as e; e.make_vector_env('dm_control/cheetah-run-v0', 1)"
-    subprocess.run([sys.executable, "-c", f"{code}; assert 'envpool' not in sys.modules"], cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "-c", f"{code}; assert 'envpool' not in sys.modules"], cwd=ROOT, check=True
+    )
