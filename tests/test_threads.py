@@ -1,4 +1,4 @@
-"""Environments that threads step against the same ones without, and what else make_vector_env takes."""
+"""Environments that threads step against the same ones without, and make_vector_env's rest."""
 
 import traceback
 
