@@ -23,7 +23,7 @@ from test_runs import (
     wait_for_rows,
 )
 
-from environments import ENVPOOL_TASKS, make_env, make_vector_env
+from environments import ENVPOOL_TASKS, envpool_has, make_env, make_vector_env
 
 pytest.importorskip("envpool")  # has no wheels for some platforms
 
@@ -271,6 +271,43 @@ def test_a_reset_starts_new_episodes_once():
     pool.step(np.ones((2, 1), np.float32))
     new, _ = pool.reset(seed=[1, 2])
     assert (new[:, 1] == 0).all() and (new[:, 0] != first[:, 0]).all()
+
+
+def test_spaces_and_seeds_are_those_of_a_vector_environment():
+    pool = make_vector_env("MountainCarContinuous-v0", 3, envpool=True)
+    assert pool.observation_space.shape == (3, 2) and pool.action_space.shape == (3, 1)
+    assert pool.action_space.contains(pool.action_space.sample())
+    obs, _ = pool.reset(seed=5)
+    listed = make_vector_env("MountainCarContinuous-v0", 3, envpool=True).reset(seed=[5, 6, 7])[0]
+    np.testing.assert_array_equal(obs, listed)
+
+
+def test_threads_change_nothing():
+    def trajectory(threads):
+        pool = make_vector_env("dm_control/cheetah-run-v0", 5, envpool=True, threads=threads)
+        rng, steps = np.random.default_rng(0), [pool.reset(seed=[3, 1, 4, 1, 5])[0]]
+        for _ in range(1010):  # over the end of the episodes
+            obs, rewards, _, truncated, infos = pool.step(rng.uniform(-1, 1, (5, 6)))
+            steps += [obs.copy(), rewards, truncated, infos.get("final_obs", np.zeros(0))]
+        return b"".join(x.tobytes() for x in steps)
+
+    assert trajectory(1) == trajectory(2)
+
+
+def test_whether_envpool_has_a_task_is_known_without_importing_it(monkeypatch):
+    assert envpool_has("dm_control/cheetah-run-v0") and not envpool_has("HalfCheetah-v5")
+    code = "import sys, environments as e; assert e.envpool_has('door-v0') and 'envpool' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: None
+    )  # as if it were not installed
+    assert not envpool_has("dm_control/cheetah-run-v0")
+
+
+def test_a_time_limit_needs_the_other_environments():
+    with pytest.raises(gym.error.Error, match="--max-episode-steps needs --no-envpool"):
+        make_vector_env("MountainCarContinuous-v0", 1, envpool=True, max_episode_steps=10)
 
 
 def test_actions_of_a_wrong_shape_are_refused():
