@@ -36,9 +36,13 @@ def colored_noise(beta, size, *, generator=None, device=None):
     try:
         scale = scale.expand(*size[:-1], T // 2 + 1)
     except RuntimeError:
-        raise ValueError(f"beta of shape {tuple(scale.shape[:-1])} does not fit the size {size}") from None
+        raise ValueError(
+            f"beta of shape {tuple(scale.shape[:-1])} does not fit the size {size}"
+        ) from None
 
-    spectrum = torch.randn(*scale.shape, 2, generator=generator, device=device)  # (..., T // 2 + 1, real and imaginary)
+    spectrum = torch.randn(
+        *scale.shape, 2, generator=generator, device=device
+    )  # (..., T // 2 + 1, real and imaginary)
     spectrum = spectrum * scale.unsqueeze(-1)
     # A real sequence has a real DC bin and, for even T, a real Nyquist bin: all their power goes into the real part.
     for k in [0] if T % 2 else [0, T // 2]:
@@ -63,13 +67,17 @@ class ColoredNoiseProcess:
     def __init__(self, beta, n_envs, action_dim, seq_len=1000, seed=0, device="cpu"):
         self.beta = torch.as_tensor(beta, dtype=torch.float64)
         if self.beta.ndim > 1 or (self.beta.ndim == 1 and self.beta.numel() not in (1, action_dim)):
-            raise ValueError(f"beta needs 1 value, or {action_dim}, one per action dimension: got {self.beta.tolist()}")
+            raise ValueError(
+                f"beta needs 1 value, or {action_dim}, one per action dimension: got {self.beta.tolist()}"
+            )
         self.size = (n_envs, action_dim, seq_len)
         self.generator = torch.Generator(device).manual_seed(seed)
         self._draw()
 
     def _draw(self):
-        noise = colored_noise(self.beta, self.size, generator=self.generator)  # (n_envs, action_dim, seq_len)
+        noise = colored_noise(
+            self.beta, self.size, generator=self.generator
+        )  # (n_envs, action_dim, seq_len)
         self.buffer = noise.permute(2, 0, 1).contiguous()  # (seq_len, n_envs, action_dim)
         self.index = 0
 
@@ -93,7 +101,9 @@ class ColoredNoiseProcess:
     def load_state_dict(self, state):
         """Restores a state of a process of the same beta and sizes; raises ValueError if the sizes differ."""
         if state["buffer"].shape != self.buffer.shape:
-            raise ValueError(f"noise state of shape {tuple(state['buffer'].shape)}, need {tuple(self.buffer.shape)}")
+            raise ValueError(
+                f"noise state of shape {tuple(state['buffer'].shape)}, need {tuple(self.buffer.shape)}"
+            )
         self.buffer = state["buffer"].to(self.generator.device)
         self.index = state["index"]
         self.generator.set_state(state["generator"].cpu())
@@ -135,7 +145,9 @@ def _bin_scale(beta, T):
     log_f = torch.fft.rfftfreq(T, dtype=torch.float64)[1:].log()
     # Dividing by sigma cancels any common factor, so the largest scale may be 1: then no beta overflows.
     beta = beta.unsqueeze(-1)
-    s = torch.exp(-0.5 * beta * (log_f - torch.where(beta > 0, log_f[0], log_f[-1])))  # s_1 .. s_(T // 2)
+    s = torch.exp(
+        -0.5 * beta * (log_f - torch.where(beta > 0, log_f[0], log_f[-1]))
+    )  # s_1 .. s_(T // 2)
     w = s.clone()
     w[..., -1] *= (1 + T % 2) / 2
     sigma = 2 / T * w.square().sum(-1, keepdim=True).sqrt()

@@ -360,11 +360,6 @@ ENVPOOL_TASKS = {
 GAIN_BY_THREADS = {"dm_control/cheetah-run-v0", "dm_control/walker-run-v0"}
 
 
-def envpool_has(env_id):
-    """Whether EnvPool is installed and has this task; imports nothing."""
-    return env_id in ENVPOOL_TASKS and importlib.util.find_spec("envpool") is not None
-
-
 class EnvPoolVectorEnv(VectorEnv):
     """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds.
 
@@ -521,17 +516,39 @@ def contact_sheet(path):
     """Saves a frame of each of the paper's environments, in the order of its figure of them, as a picture."""
     from plot import NAMES, plt
 
-    tasks = ["cartpole-balance_sparse", "cartpole-swingup_sparse", "ball_in_cup-catch", "hopper-hop", "cheetah-run"]
+    tasks = [
+        "cartpole-balance_sparse",
+        "cartpole-swingup_sparse",
+        "ball_in_cup-catch",
+        "hopper-hop",
+        "cheetah-run",
+    ]
     tasks += ["walker-run", "reacher-hard", "pendulum-swingup"]
-    ids = ["MountainCarContinuous-v0", *(f"dm_control/{task}-v0" for task in tasks), "door-v0", "PointUMaze-v1"]
-    ids += ["AntUMaze-v1", "Point4Rooms-v1", "SwimmerUMaze-v1", "Swimmer4Rooms-v1", "Ant4Rooms-v1", *MAZE_IDS[-4:]]
+    ids = [
+        "MountainCarContinuous-v0",
+        *(f"dm_control/{task}-v0" for task in tasks),
+        "door-v0",
+        "PointUMaze-v1",
+    ]
+    ids += [
+        "AntUMaze-v1",
+        "Point4Rooms-v1",
+        "SwimmerUMaze-v1",
+        "Swimmer4Rooms-v1",
+        "Ant4Rooms-v1",
+        *MAZE_IDS[-4:],
+    ]
 
-    def first_frame(env_id):  # a function, so that this environment's renderer is gone before the next one's is made
+    def first_frame(
+        env_id,
+    ):  # a function, so that this environment's renderer is gone before the next one's is made
         env = make_render_env(env_id)
         env.reset(seed=1)
         frame = env.render()
         env.close()
-        return frame[:, 40:280] if env_id.startswith("dm_control/") else frame  # without the scene's left and right
+        return (
+            frame[:, 40:280] if env_id.startswith("dm_control/") else frame
+        )  # without the scene's left and right
 
     fig, axes = plt.subplots(4, 5, figsize=(12, 10.2), layout="constrained")
     for ax, env_id in zip(axes.flat, ids, strict=True):

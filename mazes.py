@@ -94,21 +94,33 @@ class Robot(NamedTuple):
     substeps: int  # of the physics per environment step
 
 
-ROBOTS = {"ant": Robot(15, 14, 0.02, 5), "point": Robot(3, 3, 0.02, 1), "swimmer": Robot(5, 5, 0.01, 4)}
+ROBOTS = {
+    "ant": Robot(15, 14, 0.02, 5),
+    "point": Robot(3, 3, 0.02, 1),
+    "swimmer": Robot(5, 5, 0.01, 4),
+}
 
 
 def read_grid(grid, scale):
     """The cells of a text grid as (character, x, y) in reading order; centers (x, y) in m, the robot's at (0, 0)."""
     rows = grid.split()
     row0, col0 = next((i, row.index("R")) for i, row in enumerate(rows) if "R" in row)
-    return [(c, (j - col0) * scale, (i - row0) * scale) for i, row in enumerate(rows) for j, c in enumerate(row)]
+    return [
+        (c, (j - col0) * scale, (i - row0) * scale)
+        for i, row in enumerate(rows)
+        for j, c in enumerate(row)
+    ]
 
 
 def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
     """The robot's model from Gymnasium, changed to mujoco-maze's, with the maze around it. Returns a mujoco.MjModel."""
-    spec = mujoco.MjSpec.from_file(str(Path(gym.__file__).parent / f"envs/mujoco/assets/{robot}.xml"))
+    spec = mujoco.MjSpec.from_file(
+        str(Path(gym.__file__).parent / f"envs/mujoco/assets/{robot}.xml")
+    )
     spec.option.timestep = ROBOTS[robot].timestep
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # same contacts; the ant's steps take 10 % less
+    spec.option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    )  # same contacts; the ant's steps take 10 % less
     has_blocks = any(c == "M" for c, _, _ in cells)
     if robot == "ant":
         for actuator in spec.actuators:
@@ -130,18 +142,31 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
     floor.reflectance, tiles.rgb1, tiles.rgb2 = 0, [0.80, 0.82, 0.85], [0.70, 0.72, 0.76]
 
     height = scale / 2
-    box = dict(type=mujoco.mjtGeom.mjGEOM_BOX, size=[scale / 2, scale / 2, height / 2], contype=1, conaffinity=1)
+    box = dict(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[scale / 2, scale / 2, height / 2],
+        contype=1,
+        conaffinity=1,
+    )
     for i, (c, x, y) in enumerate(cells):
         if c == "#":
-            spec.worldbody.add_geom(**box, name=f"wall_{i}", pos=[x, y, height / 2], rgba=[0.35, 0.4, 0.5, 1])
+            spec.worldbody.add_geom(
+                **box, name=f"wall_{i}", pos=[x, y, height / 2], rgba=[0.35, 0.4, 0.5, 1]
+            )
         elif c == "M":
             body = spec.worldbody.add_body(name=f"block_{i}", pos=[x, y, height / 2])
             body.add_geom(**box, name=f"block_{i}", mass=0.0002, rgba=[0.75, 0.15, 0.2, 1])
             for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0])):
-                joint = body.add_joint(name=f"block_{i}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+                joint = body.add_joint(
+                    name=f"block_{i}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis
+                )
                 joint.limited, joint.armature, joint.damping, joint.margin = 0, 0, [0, 0, 0], 0.01
     # A post as wide as the goal, which stands out of the wall where the goal is inside one.
-    post = dict(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[GOAL_RADIUS, 0.7 * height, 0], rgba=[0.1, 0.7, 0.1, 1])
+    post = dict(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[GOAL_RADIUS, 0.7 * height, 0],
+        rgba=[0.1, 0.7, 0.1, 1],
+    )
     spec.worldbody.add_site(**post, name="goal", pos=[*goal, 0.7 * height])
 
     model = spec.compile()
@@ -161,10 +186,16 @@ def set_old_capsule_inertia(model):
         if count == 1 and model.geom_type[first] == mujoco.mjtGeom.mjGEOM_CAPSULE:
             r, half_length, _ = model.geom_size[first]
             h = 2 * half_length + r
-            mass = model.body_mass[body] * h / (h + r / 3)  # the exact volume is pi r^2 (L + 4 r / 3)
+            mass = (
+                model.body_mass[body] * h / (h + r / 3)
+            )  # the exact volume is pi r^2 (L + 4 r / 3)
             across = mass * (3 * r**2 + h**2) / 12
             model.body_mass[body] = mass
-            model.body_inertia[body] = [across, across, mass * r**2 / 2]  # the capsule's axis is the third
+            model.body_inertia[body] = [
+                across,
+                across,
+                mass * r**2 / 2,
+            ]  # the capsule's axis is the third
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
@@ -194,7 +225,9 @@ class WallReflection:
             a, b = start[axis] - across, end[axis] - across
             if a * b <= 0 and a != b:
                 t = a / (a - b)
-                if low <= start[1 - axis] + t * delta[1 - axis] <= high and (nearest is None or t < nearest[0]):
+                if low <= start[1 - axis] + t * delta[1 - axis] <= high and (
+                    nearest is None or t < nearest[0]
+                ):
                     nearest = (t, face)
         return nearest
 
@@ -234,7 +267,9 @@ class MazeEnv(gym.Env):
     def __init__(self, robot, maze, goal=None, old_capsule_inertia=True, render_mode=None):
         if maze not in MAZES or robot not in MAZES[maze].scale:
             choices = ", ".join(f"{r} in {m}" for m in MAZES for r in MAZES[m].scale)
-            raise ValueError(f"no maze task for robot {robot!r} in maze {maze!r}; there are {choices}")
+            raise ValueError(
+                f"no maze task for robot {robot!r} in maze {maze!r}; there are {choices}"
+            )
         self.robot, self.render_mode = robot, render_mode
         self.nq, self.nv, timestep, self.substeps = ROBOTS[robot]
         self.dt = timestep * self.substeps
@@ -249,11 +284,15 @@ class MazeEnv(gym.Env):
         # Views into MuJoCo's memory, kept because making one takes as long as using it.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         n_blocks = (self.model.nq - self.nq) // 2
-        self._block_pos = self.data.xpos[self.model.nbody - n_blocks :].reshape(-1)  # (3 * n_blocks,)
+        self._block_pos = self.data.xpos[self.model.nbody - n_blocks :].reshape(
+            -1
+        )  # (3 * n_blocks,)
 
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.nq + self.nv + 3 * n_blocks + 1,), np.float64)
+        self.observation_space = gym.spaces.Box(
+            -np.inf, np.inf, (self.nq + self.nv + 3 * n_blocks + 1,), np.float64
+        )
         self._low, self._high = self.model.actuator_ctrlrange.T.copy()
         self._renderer = None
 
@@ -283,7 +322,9 @@ class MazeEnv(gym.Env):
             mujoco.mj_step(self.model, self.data, self.substeps)
             speed = math.hypot(self._qpos[0] - x, self._qpos[1] - y) / self.dt
             reward = INNER_REWARD * (speed - CONTROL_COST * float(action @ action))
-        reached = math.hypot(self._qpos[0] - self.goal[0], self._qpos[1] - self.goal[1]) <= GOAL_RADIUS
+        reached = (
+            math.hypot(self._qpos[0] - self.goal[0], self._qpos[1] - self.goal[1]) <= GOAL_RADIUS
+        )
         reward += 1.0 if reached else STEP_REWARD
         return self._observation(), reward, reached, False, {"success": reached}
 
@@ -300,9 +341,17 @@ class MazeEnv(gym.Env):
 
     def _observation(self):
         nq, nv = self.nq, self.nv
-        if self._block_pos.size:  # mj_step leaves positions where the integrator's last stage had them
+        if (
+            self._block_pos.size
+        ):  # mj_step leaves positions where the integrator's last stage had them
             mujoco.mj_kinematics(self.model, self.data)
-        parts = (self._qpos[:3], self._block_pos, self._qpos[3:nq], self._qvel[:nv], (0.001 * self._steps,))
+        parts = (
+            self._qpos[:3],
+            self._block_pos,
+            self._qpos[3:nq],
+            self._qvel[:nv],
+            (0.001 * self._steps,),
+        )
         return np.concatenate(parts)
 
     def render(self):
@@ -311,11 +360,17 @@ class MazeEnv(gym.Env):
             return None
         if self._renderer is None:
             self._renderer = mujoco.Renderer(self.model, 480, 480)
-            weakref.finalize(self, self._renderer.close)  # at exit at the latest, while OpenGL still works
+            weakref.finalize(
+                self, self._renderer.close
+            )  # at exit at the latest, while OpenGL still works
             xy = np.array([(x, y) for _, x, y in self.cells])
             self._camera = mujoco.MjvCamera()
             self._camera.lookat = [*(xy.min(0) + xy.max(0)) / 2, 0]
-            self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.55 * np.ptp(xy, 0).max(), 90, -65
+            self._camera.distance, self._camera.azimuth, self._camera.elevation = (
+                1.55 * np.ptp(xy, 0).max(),
+                90,
+                -65,
+            )
         mujoco.mj_kinematics(self.model, self.data)
         self._renderer.update_scene(self.data, self._camera)
         return self._renderer.render()

@@ -29,7 +29,12 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 STUDY_BETAS = [-1, 0, 0.2, 0.5, 0.75, 1, 1.25, 2]
-COMPLEX = ["PointPush-v1", "AntPush-v1", "PointPushMaze-v1", "AntPushMaze-v1"]  # Sec. A8: not in the averages
+COMPLEX = [
+    "PointPush-v1",
+    "AntPush-v1",
+    "PointPushMaze-v1",
+    "AntPushMaze-v1",
+]  # Sec. A8: not in the averages
 # fmt: off
 NAMES = {  # environment id: its name in the paper (Sec. A4)
     "MountainCarContinuous-v0": "Mountain Car", "dm_control/ball_in_cup-catch-v0": "Ball in Cup (Catch)",
@@ -46,7 +51,15 @@ NAMES = {  # environment id: its name in the paper (Sec. A4)
 # The study varies AXES. Other arguments must not vary within an environment, but FREE_ARGS and NOT_ARGUMENTS.
 AXES = ["environment", "beta", "n_envs", "n_steps", "n_epochs", "seed"]
 CELL = ["environment", "n_envs"]
-NOT_ARGUMENTS = ["path", "source", "status", "git_commit", "wall_seconds", "performance", "final_return"]
+NOT_ARGUMENTS = [
+    "path",
+    "source",
+    "status",
+    "git_commit",
+    "wall_seconds",
+    "performance",
+    "final_return",
+]
 NOT_ARGUMENTS += ["exp_name", "env_id", "vanilla"]  # or shown by others
 
 
@@ -72,7 +85,13 @@ def read_run(folder):
         args = config["args"]
         beta = "vanilla" if args["vanilla"] else "_".join(f"{beta:g}" for beta in args["beta"])
         whole = {key: int(args[key]) for key in ("n_envs", "n_steps", "n_epochs", "seed")}
-        run = {**args, **whole, "env_id": str(args["env_id"]), "beta": beta, "git_commit": config["git_commit"]}
+        run = {
+            **args,
+            **whole,
+            "env_id": str(args["env_id"]),
+            "beta": beta,
+            "git_commit": config["git_commit"],
+        }
         rows = (folder / "evaluations.csv").read_text().splitlines()[1:]
         table = np.array([row.split(",")[:2] for row in rows], float).reshape(-1, 2)
         steps, returns = table[:, 0].astype(int), table[:, 1]
@@ -83,7 +102,9 @@ def read_run(folder):
             if len(returns) == 0 or not np.isfinite(returns).all() or (np.diff(steps) <= 0).any():
                 raise ValueError("evaluations.csv is not a series of finite returns")
             measured = [returns.mean(), returns[-1]]
-            if not np.allclose([summary["performance"], summary["final_return"]], measured, rtol=1e-4, atol=1e-4):
+            if not np.allclose(
+                [summary["performance"], summary["final_return"]], measured, rtol=1e-4, atol=1e-4
+            ):
                 raise ValueError("summary.json does not agree with evaluations.csv")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         run["status"] = f"{'unfinished' if run and not complete else 'damaged'}: {error!r}"
@@ -94,7 +115,10 @@ def read_folder(path):
     """Reads all runs under a folder: (runs, curves) as in `load`."""
     names = ("config.json", "evaluations.csv")
     folders = sorted({file.parent for name in names for file in path.rglob(name)})
-    read = [read_run(folder) for folder in tqdm(folders, desc=f"reading {path}", unit=" runs", mininterval=0.5)]
+    read = [
+        read_run(folder)
+        for folder in tqdm(folders, desc=f"reading {path}", unit=" runs", mininterval=0.5)
+    ]
     runs = pd.DataFrame([run for run, _, _ in read])
     runs["path"] = [folder.relative_to(path).as_posix() for folder in folders]
     all_steps = np.unique(np.concatenate([np.zeros(0, int), *(steps for _, steps, _ in read)]))
@@ -129,18 +153,28 @@ def load(paths, env=None, beta=None, n_envs=None):
             steps = [column for column in runs if column.isdigit()]
             runs, curves = runs.drop(columns=steps), runs[steps].rename(columns=int)
         if runs.empty:
-            raise Unusable(f"no runs in {path}: ppo_colored_continuous.py and run_sweep.sh make them")
+            raise Unusable(
+                f"no runs in {path}: ppo_colored_continuous.py and run_sweep.sh make them"
+            )
         tables.append((runs.assign(source=str(path)), curves))
     runs, curves = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
     runs = runs.reindex(columns=runs.columns.union(["env_id", *AXES], sort=False))
-    runs["environment"] = runs.env_id.map(lambda env_id: NAMES.get(env_id, env_id), na_action="ignore")
+    runs["environment"] = runs.env_id.map(
+        lambda env_id: NAMES.get(env_id, env_id), na_action="ignore"
+    )
     # Sec. "Evaluation Details": performance is the mean over all evaluations, the area under the learning curve.
     curves = curves.sort_index(axis=1)
     runs["performance"] = curves.mean(axis=1)
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1] if len(curves.columns) else np.nan
-    for columns, wanted in ((["environment", "env_id"], env), (["beta"], beta), (["n_envs"], n_envs)):
+    for columns, wanted in (
+        (["environment", "env_id"], env),
+        (["beta"], beta),
+        (["n_envs"], n_envs),
+    ):
         if wanted:
-            runs = runs[runs[columns].isin(wanted).any(axis=1) | runs.env_id.isna()]  # damaged ones stay, to be listed
+            runs = runs[
+                runs[columns].isin(wanted).any(axis=1) | runs.env_id.isna()
+            ]  # damaged ones stay, to be listed
     return runs, curves.loc[runs.index]
 
 
@@ -149,7 +183,15 @@ def pack(runs, curves, file):
 
     It is compressed where its name ends in .gz.
     """
-    derived = ["source", "environment", "performance", "final_return", "runs_dir", "resume", "overwrite"]
+    derived = [
+        "source",
+        "environment",
+        "performance",
+        "final_return",
+        "runs_dir",
+        "resume",
+        "overwrite",
+    ]
     table = runs.drop(columns=derived, errors="ignore").dropna(axis=1, how="all")
     pd.concat([table, curves], axis=1).to_csv(file, index=False, float_format="%.9g")
 
@@ -169,18 +211,27 @@ def select(runs):
     left_out = (runs.source + "/" + runs.path + ": " + status)[status != "complete"].tolist()
     chosen = runs[status == "complete"]
     if chosen.empty:
-        raise Unusable("no complete run of these environments, betas and n_envs" + "; ".join(["", *left_out[:1]]))
+        raise Unusable(
+            "no complete run of these environments, betas and n_envs"
+            + "; ".join(["", *left_out[:1]])
+        )
     if "envpool" in complete:
         complete = complete.assign(envpool=complete.envpool.eq(True))  # older runs do not have it
     for environment, group in complete.groupby("environment"):
         for argument in group.columns.difference([*AXES, *FREE_ARGS, *NOT_ARGUMENTS]):
             values = sorted(group[argument].dropna().astype(str).unique())
             if len(values) > 1:
-                mix = " and ".join(f"--{argument.replace('_', '-')} {value}" for value in values[:3])
+                mix = " and ".join(
+                    f"--{argument.replace('_', '-')} {value}" for value in values[:3]
+                )
                 advice = "give the folder of one experiment, or filter by --env, --beta, --n-envs"
-                raise Unusable(f"{environment} has runs with {mix}, which must not be averaged: {advice}")
+                raise Unusable(
+                    f"{environment} has runs with {mix}, which must not be averaged: {advice}"
+                )
     chosen = chosen.astype({key: int for key in ("n_envs", "n_steps", "n_epochs", "seed")})
-    return chosen.assign(beta=pd.to_numeric(chosen.beta, errors="coerce"), vanilla=chosen.beta == "vanilla"), left_out
+    return chosen.assign(
+        beta=pd.to_numeric(chosen.beta, errors="coerce"), vanilla=chosen.beta == "vanilla"
+    ), left_out
 
 
 def main_grid(runs):
@@ -196,9 +247,14 @@ def missing(runs):
     runs = runs.assign(beta=runs.beta.map(beta_text))[axes]
     grid = pd.MultiIndex.from_product([sorted(runs[axis].unique()) for axis in axes], names=axes)
     lacking = grid.difference(pd.MultiIndex.from_frame(runs)).to_frame(index=False)
-    seeds = lacking.groupby(axes[:3]).seed.agg(lambda seeds: " ".join(map(str, seeds))).reset_index()
+    seeds = (
+        lacking.groupby(axes[:3]).seed.agg(lambda seeds: " ".join(map(str, seeds))).reset_index()
+    )
     betas = seeds.groupby(["environment", "n_envs", "seed"]).beta.agg(" ".join)
-    return [f"{env}, n_envs {n_envs}: beta {beta}, seeds {seeds}" for (env, n_envs, seeds), beta in betas.items()]
+    return [
+        f"{env}, n_envs {n_envs}: beta {beta}, seeds {seeds}"
+        for (env, n_envs, seeds), beta in betas.items()
+    ]
 
 
 def published(name):
@@ -235,8 +291,15 @@ def mean_interval(values, n_resamples=9999):
     if len(values) < 2:
         low, high = low * np.nan, high * np.nan
     elif varies.any():
-        how = {"n_resamples": n_resamples, "batch": 1000, "method": "BCa", "rng": np.random.default_rng(0)}
-        low[varies], high[varies] = stats.bootstrap([values.T[varies]], np.mean, axis=-1, **how).confidence_interval
+        how = {
+            "n_resamples": n_resamples,
+            "batch": 1000,
+            "method": "BCa",
+            "rng": np.random.default_rng(0),
+        }
+        low[varies], high[varies] = stats.bootstrap(
+            [values.T[varies]], np.mean, axis=-1, **how
+        ).confidence_interval
     return mean, low, high
 
 
@@ -254,7 +317,9 @@ def welch(a, b):
     if np.ptp([*a, *b]) == 0:
         return 1.0
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # scipy's, about values that are nearly the same
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # scipy's, about values that are nearly the same
         return stats.ttest_ind(a, b, equal_var=False).pvalue
 
 
@@ -265,15 +330,23 @@ def best_beta_per_env(runs):
     """
     rows = []
     for environment, group in runs.groupby("environment"):
-        performance = {beta: values.to_numpy() for beta, values in group.groupby("beta").performance}
+        performance = {
+            beta: values.to_numpy() for beta, values in group.groupby("beta").performance
+        }
         best = max(performance, key=lambda beta: performance[beta].mean())
         row = {"environment": environment, "best_beta": best}
         for beta in (0.5, 0.0, 1.0):
             p = welch(performance[best], performance.get(beta, [])) if beta != best else np.nan
-            row[f"beta_{beta}"] = "outperformed" if p < 0.05 else "comparable" if p >= 0.05 or beta == best else ""
+            row[f"beta_{beta}"] = (
+                "outperformed" if p < 0.05 else "comparable" if p >= 0.05 or beta == best else ""
+            )
             row[f"p_{beta}"] = p
         rows.append(row)
-    paper = published("best_beta_per_env").set_index("environment").replace({"yes": "comparable", "no": "outperformed"})
+    paper = (
+        published("best_beta_per_env")
+        .set_index("environment")
+        .replace({"yes": "comparable", "no": "outperformed"})
+    )
     paper = paper.rename(columns=lambda name: "paper_" + name.removesuffix("_comparable"))
     table = pd.DataFrame(rows).join(paper, on="environment")
     counts = {"environment": "comparable in"}
@@ -288,7 +361,9 @@ def best_beta_per_n_envs(runs):
     table = mean_intervals(runs.assign(z=standardize(runs)), "z", ["n_envs", "beta"])
     best = table.loc[table.groupby("n_envs")["mean"].idxmax()].reset_index()
     best = best.rename(columns={"beta": "best_beta", "mean": "standardized_performance"})
-    return best.join(published("best_beta_per_n_envs").set_index("n_envs").add_prefix("paper_"), on="n_envs")
+    return best.join(
+        published("best_beta_per_n_envs").set_index("n_envs").add_prefix("paper_"), on="n_envs"
+    )
 
 
 def projected_ranks(best, betas, n_envs, seq_len=1000):
@@ -324,7 +399,9 @@ def final_returns(runs):
     """
     cell = [*CELL, "beta"]
     table = mean_intervals(runs.assign(beta=runs.beta.map(beta_text)), "final_return", cell)
-    table = table.join(published("final_return_per_beta").set_index(cell).final_return_mean.rename("paper"))
+    table = table.join(
+        published("final_return_per_beta").set_index(cell).final_return_mean.rename("paper")
+    )
     known = table.dropna(subset=["low", "paper"])
     holds = known.paper.between(known.low - 0.05, known.high + 0.05)
     return table.assign(in_interval=holds.map({True: "yes", False: "no"})).reset_index()
@@ -342,10 +419,15 @@ def final_return_per_beta(table):
             interval = "" if pd.isna(cell["low"]) else " [{low:z.1f}, {high:z.1f}]".format(**cell)
             outside = " (outside)" if cell["in_interval"] == "no" else ""
             row[f"beta {cell['beta']}"] = f"{cell['mean']:z.1f}{interval}"
-            row[f"paper, {cell['beta']}"] = "" if pd.isna(cell["paper"]) else f"{cell['paper']:z.1f}{outside}"
+            row[f"paper, {cell['beta']}"] = (
+                "" if pd.isna(cell["paper"]) else f"{cell['paper']:z.1f}{outside}"
+            )
         rows.append(row)
     betas = sorted(table.beta.unique())
-    return pd.DataFrame(rows, columns=[*CELL, "runs", *(f"{of} {beta}" for beta in betas for of in ("beta", "paper,"))])
+    return pd.DataFrame(
+        rows,
+        columns=[*CELL, "runs", *(f"{of} {beta}" for beta in betas for of in ("beta", "paper,"))],
+    )
 
 
 def robust_statistics(runs):
@@ -365,7 +447,9 @@ def robust_statistics(runs):
         signs = [np.sign(x[..., :, None] - y[..., None, :]).mean((-2, -1)) for x, y in pairs]
         return 0.5 + 0.5 * np.mean(signs, axis=0)
 
-    cells = {key: z.to_numpy() for key, z in runs.assign(z=standardize(runs)).groupby(["beta", *CELL]).z}
+    cells = {
+        key: z.to_numpy() for key, z in runs.assign(z=standardize(runs)).groupby(["beta", *CELL]).z
+    }
     rows = []
     for beta in sorted(runs.beta.unique()):
         ours = {key[1:]: z for key, z in cells.items() if key[0] == beta}
@@ -375,8 +459,15 @@ def robust_statistics(runs):
         for statistic, samples in ((iqm, list(ours.values())), (improvement, pairs)):
             name, low, high = statistic.__name__, np.nan, np.nan
             if samples and min(map(len, samples)) > 1:
-                how = {"n_resamples": 2000, "batch": 200, "method": "percentile", "rng": np.random.default_rng(0)}
-                low, high = stats.bootstrap(samples, statistic, vectorized=True, **how).confidence_interval
+                how = {
+                    "n_resamples": 2000,
+                    "batch": 200,
+                    "method": "percentile",
+                    "rng": np.random.default_rng(0),
+                }
+                low, high = stats.bootstrap(
+                    samples, statistic, vectorized=True, **how
+                ).confidence_interval
             mean = statistic(*samples) if samples else np.nan
             row |= {name: mean, f"{name}_low": low, f"{name}_high": high}
         rows.append(row)
@@ -400,7 +491,10 @@ STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 def look(beta):
     """Color and marker of a beta in all figures: a sequential, color-blind-safe map, nowhere too pale for print."""
     place = np.interp(beta, STUDY_BETAS, range(len(STUDY_BETAS)))
-    return {"color": plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1)), "marker": "v^osDPX*"[round(place)]}
+    return {
+        "color": plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1)),
+        "marker": "v^osDPX*"[round(place)],
+    }
 
 
 def color(beta):
@@ -426,7 +520,9 @@ def panels(count, xlabel="", ylabel="", width=2.5, height=1.9):
     """A figure with `count` axes in even rows of at most four, labelled at its left and below: figure, list of axes."""
     rows = math.ceil(count / 4)
     columns = math.ceil(count / rows)
-    fig, axes = plt.subplots(rows, columns, figsize=(max(width * columns, 5), height * rows + 0.5), squeeze=False)
+    fig, axes = plt.subplots(
+        rows, columns, figsize=(max(width * columns, 5), height * rows + 0.5), squeeze=False
+    )
     for ax in axes.flat[count:]:
         ax.remove()
     axes = list(axes.flat[:count])
@@ -472,7 +568,9 @@ def draw_grid(ax, sizes, title):
     for column, n_envs in enumerate(sizes):
         for row, (beta, size) in enumerate(sizes[n_envs].dropna().items()):
             edge = "black" if size == sizes[n_envs].max() else "none"
-            ax.scatter(column, row, s=8 + 200 * size, color=color(beta), edgecolor=edge, linewidth=1.4)
+            ax.scatter(
+                column, row, s=8 + 200 * size, color=color(beta), edgecolor=edge, linewidth=1.4
+            )
     ax.set_xticks(range(sizes.shape[1]), sizes.columns)
     ax.set_yticks(range(len(sizes)), [f"{beta:g}" for beta in sizes.index])
     ax.set(title=title, xlim=(-0.6, sizes.shape[1] - 0.4), ylim=(-0.6, len(sizes) - 0.4))
@@ -522,13 +620,17 @@ def power_spectral_density(betas):
 
 def two_step_scatter(betas):
     """Sec. A1: subsequent values are correlated where beta > 0; their correlation measured and in closed form."""
-    fig, axes = panels(len(betas), r"$\varepsilon_t$", r"$\varepsilon_{t+1}$", width=2.2, height=2.2)
+    fig, axes = panels(
+        len(betas), r"$\varepsilon_t$", r"$\varepsilon_{t+1}$", width=2.2, height=2.2
+    )
     for ax, beta in zip(axes, betas, strict=True):
         noise, lags = draw_noise(beta, 2000).numpy(), autocovariance(beta, 1000)
         correlation = np.corrcoef(noise[:, :-1].ravel(), noise[:, 1:].ravel())[0, 1]
         ax.scatter(noise[:, 500], noise[:, 501], s=3, color=color(beta), alpha=0.5, lw=0)
         closed_form = float(lags[1] / lags[0])
-        ax.set_title(f"$\\beta = {beta:g}$, correlation {correlation:z.2f}\n(closed form {closed_form:z.2f})")
+        ax.set_title(
+            f"$\\beta = {beta:g}$, correlation {correlation:z.2f}\n(closed form {closed_form:z.2f})"
+        )
         ax.set(xlim=(-4.5, 4.5), ylim=(-4.5, 4.5), aspect="equal", xticks=[-4, -2, 0, 2, 4])
     return fig
 
@@ -539,11 +641,15 @@ def marginal_distribution(betas):
     x = np.linspace(-4.5, 4.5, 91)
     for ax, beta in zip(axes, betas, strict=True):
         noise, variance = draw_noise(beta, 5000), float(marginal_variance(beta, 1000))
-        ax.hist(noise[:, ::50].flatten().numpy(), bins=x, density=True, color=color(beta), alpha=0.6)
+        ax.hist(
+            noise[:, ::50].flatten().numpy(), bins=x, density=True, color=color(beta), alpha=0.6
+        )
         ax.plot(x, stats.norm.pdf(x, scale=variance**0.5), color="black", lw=0.9)
         ax.set_title(rf"$\beta = {beta:g}$, variance {noise.var():.2f} ({variance:.2f})")
         ax.set(ylim=(0, 0.45), xticks=[-4, -2, 0, 2, 4])
-    legend_above(fig, ("normal distribution of the (closed-form) variance", {"color": "black", "lw": 0.9}))
+    legend_above(
+        fig, ("normal distribution of the (closed-form) variance", {"color": "black", "lw": 0.9})
+    )
     return fig
 
 
@@ -603,7 +709,11 @@ def beta0_vs_vanilla(runs):
     runs = runs[(runs.beta == 0) | runs.vanilla]
     runs = runs[runs.groupby(CELL).vanilla.transform("nunique") == 2]
     need(len(runs), "runs with --beta 0 and runs with --vanilla")
-    return compare(runs.assign(algorithm=np.where(runs.vanilla, "vanilla PPO", r"$\beta = 0$")), "n_envs", "algorithm")
+    return compare(
+        runs.assign(algorithm=np.where(runs.vanilla, "vanilla PPO", r"$\beta = 0$")),
+        "n_envs",
+        "algorithm",
+    )
 
 
 def n_envs_vs_n_steps(runs):
@@ -631,8 +741,12 @@ def n_envs_beta_grids(runs):
     axes_of_grid = (grid.index, grid.columns, int(runs.noise_seq_len.iloc[0]))
     ranks = {
         "rank of performance within n_envs": grid.rank(ascending=False),
-        "rank projected from the bias,\nby our best $\\beta$": projected_ranks(grid.idxmax(), *axes_of_grid),
-        "rank projected from the bias,\nby the paper's best $\\beta$": projected_ranks(paper, *axes_of_grid),
+        "rank projected from the bias,\nby our best $\\beta$": projected_ranks(
+            grid.idxmax(), *axes_of_grid
+        ),
+        "rank projected from the bias,\nby the paper's best $\\beta$": projected_ranks(
+            paper, *axes_of_grid
+        ),
     }
     fig, axes = panels(4, "n_envs", BETA, width=2.9, height=3.1)
     low, high = np.nanmin(grid), np.nanmax(grid)
@@ -664,7 +778,10 @@ def learning_curves(runs, curves, by):
             ax.plot(1.05 * end, final, mfc="none", **look(beta))
         ax.set_title(f"{environment}, n_envs {n_envs}")
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
-    band, paper = ("95 % BCa interval", {"lw": 6, "alpha": 0.3}), ("paper", {"marker": "o", "ls": "", "mfc": "none"})
+    band, paper = (
+        ("95 % BCa interval", {"lw": 6, "alpha": 0.3}),
+        ("paper", {"marker": "o", "ls": "", "mfc": "none"}),
+    )
     legend_above(fig, band, paper, betas=sorted(runs.beta.unique()))
     return fig
 
@@ -688,8 +805,19 @@ def final_return_vs_n_envs(table):
     fig, axes = panels(table.environment.nunique(), "n_envs", "final return")
     for ax, (environment, group) in zip(axes, table.groupby("environment"), strict=True):
         for beta, cells in group.groupby("beta"):
-            x = cells.n_envs * 2 ** (0.5 * (betas.index(beta) + 0.5) / len(betas) - 0.25)  # side by side
-            ax.plot(x, cells.paper, color=color(beta), ls=":", lw=0.9, ms=7, mfc="none", marker=look(beta)["marker"])
+            x = cells.n_envs * 2 ** (
+                0.5 * (betas.index(beta) + 0.5) / len(betas) - 0.25
+            )  # side by side
+            ax.plot(
+                x,
+                cells.paper,
+                color=color(beta),
+                ls=":",
+                lw=0.9,
+                ms=7,
+                mfc="none",
+                marker=look(beta)["marker"],
+            )
             draw_intervals(ax, x, cells, **look(beta), ms=4)
         log2_ticks(ax, table.n_envs)
         ax.set(title=environment, xlim=(table.n_envs.min() / 1.5, table.n_envs.max() * 1.5))
@@ -723,13 +851,19 @@ def save_table(table, out, name):
             return value if isinstance(value, str) else ""
         if column.startswith("p_") and value < 0.01:
             return "<0.01"
-        return f"{value:g}" if column.endswith("beta") or isinstance(value, int) else f"{value:z.2f}"
+        return (
+            f"{value:g}" if column.endswith("beta") or isinstance(value, int) else f"{value:z.2f}"
+        )
 
-    shown = pd.DataFrame({column: [text(column, value) for value in table[column].tolist()] for column in table})
+    shown = pd.DataFrame(
+        {column: [text(column, value) for value in table[column].tolist()] for column in table}
+    )
     rows = [shown.columns, ["---"] * shown.shape[1], *shown.to_numpy()]
     table.to_csv(out / f"{name}.csv", index=False)
     (out / f"{name}.md").write_text("".join(f"| {' | '.join(row)} |\n" for row in rows))
-    (out / f"{name}.tex").write_text(shown.to_latex(index=False, escape=True, longtable=True).replace("<", "$<$"))
+    (out / f"{name}.tex").write_text(
+        shown.to_latex(index=False, escape=True, longtable=True).replace("<", "$<$")
+    )
 
 
 def make_all(todo, out):
@@ -761,7 +895,10 @@ def noise(betas):
     return {
         "noise_random_walks": (random_walks, betas),
         "noise_psd": (power_spectral_density, betas),
-        "noise_two_step": (two_step_scatter, [beta for beta in betas if beta in (0, 0.5, 1)] or betas),
+        "noise_two_step": (
+            two_step_scatter,
+            [beta for beta in betas if beta in (0, 0.5, 1)] or betas,
+        ),
         "noise_marginal": (marginal_distribution, betas),
         "noise_bias": (bias, betas),
     }
@@ -794,13 +931,17 @@ def results(runs, curves):
         todo[f"learning_curves_n_envs_{n_envs}"] = (learning_curves, group, curves, "environment")
     for environment, group in colored.groupby("environment"):
         if group.n_envs.nunique() > 1:
-            name = "".join(c for c in environment.lower().replace(" ", "_") if c.isalnum() or c == "_")
+            name = "".join(
+                c for c in environment.lower().replace(" ", "_") if c.isalnum() or c == "_"
+            )
             todo[f"learning_curves_{name}"] = (learning_curves, group, curves, "n_envs")
     return todo
 
 
 def parse_args():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     noise = commands.add_parser("noise", help="figures of the noise")
     results = commands.add_parser("results", help="figures and tables of runs")
@@ -819,13 +960,25 @@ def parse_args():
 
     for command in (results, packing):
         command.add_argument("paths", nargs="+", help="folders of runs, or files that `pack` wrote")
-        command.add_argument("--env", nargs="+", metavar="ENV", help="only these: ids, or names as in the paper")
-        command.add_argument("--beta", nargs="+", type=beta, metavar="BETA", help="only these; vanilla for vanilla PPO")
+        command.add_argument(
+            "--env", nargs="+", metavar="ENV", help="only these: ids, or names as in the paper"
+        )
+        command.add_argument(
+            "--beta",
+            nargs="+",
+            type=beta,
+            metavar="BETA",
+            help="only these; vanilla for vanilla PPO",
+        )
         command.add_argument("--n-envs", nargs="+", type=int, metavar="N", help="only these")
     packing.add_argument("file", help="CSV to write, or .csv.gz")
-    noise.add_argument("--beta", nargs="+", type=number, default=STUDY_BETAS, help="default: those of the study")
+    noise.add_argument(
+        "--beta", nargs="+", type=number, default=STUDY_BETAS, help="default: those of the study"
+    )
     for command in (noise, results):
-        command.add_argument("--out", type=Path, default=Path("figures"), help="folder for figures and tables")
+        command.add_argument(
+            "--out", type=Path, default=Path("figures"), help="folder for figures and tables"
+        )
     return parser.parse_args()
 
 

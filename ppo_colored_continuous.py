@@ -88,7 +88,8 @@ def parse_args(argv=None, **defaults):
     if args.resume and args.overwrite:
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
     if args.envpool is None:  # a run that is there keeps what it has
-        args.envpool = run_files.recorded(args, "envpool", default=envpool_has(args.env_id))
+        usable = envpool_has(args.env_id) and args.max_episode_steps is None
+        args.envpool = run_files.recorded(args, "envpool", default=usable)
     run_files.check_device(args.device)
     return run_files.Args(**vars(args))
 
@@ -328,9 +329,10 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     run_files.prepare_torch()
     # Everything that can fail comes first, before run.start() touches anything of an earlier run
     with run_files.one_line_for(gym.error.Error):
-        video_env = make_render_env(args.env_id) if args.capture_video else None
-        envs = make_vector_env(args.env_id, args.n_envs, args.envpool)
-        eval_envs = make_vector_env(args.env_id, args.eval_episodes, args.envpool)
+        how = (args.envpool, args.threads, args.max_episode_steps)
+        video_env = make_render_env(args.env_id, how[2]) if args.capture_video else None
+        envs = make_vector_env(args.env_id, args.n_envs, *how)
+        eval_envs = make_vector_env(args.env_id, args.eval_episodes, *how)
     obs_dim = envs.single_observation_space.shape[0]
     action_dim = math.prod(envs.single_action_space.shape)
     if len(args.beta) not in (1, action_dim):

@@ -171,7 +171,7 @@ def main("""
 
 def test_normalize_observations_by_a_wrapper(tmp_path):
     """Written out, since Gymnasium's own for vector environments refuse SAME_STEP autoreset."""
-    make = "make_vector_env(args.env_id, args.n_envs, args.envpool)"
+    make = "make_vector_env(args.env_id, args.n_envs, *how)"
     module = edit(tmp_path, (make, f"NormalizeObservations({make})"), ("def main(", NORMALIZE))
     observations = []
 
