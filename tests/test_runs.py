@@ -426,7 +426,7 @@ class Mine(gym.Env):
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    episodes = 0
+    episodes, signaled = 0, False
 
     def __init__(self, what=None):
         self.what = what
@@ -449,7 +449,8 @@ class Mine(gym.Env):
                 open("/does/not/exist")
             elif self.what == "gym":
                 raise gym.error.InvalidAction("mine")
-            elif self.what == "signal":
+            elif self.what == "signal" and not Mine.signaled:
+                Mine.signaled = True
                 try:  # as dm_control does, in a property lookup
                     os.kill(os.getpid(), signal.SIGTERM)
                     time.sleep(0.01)
