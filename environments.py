@@ -67,9 +67,8 @@ MAZE_IDS += ["PointPush-v1", "AntPush-v1", "PointPushMaze-v1", "AntPushMaze-v1"]
 for env_id in MAZE_IDS:  # Gymnasium's checks of every step would cost more than the point's physics
     robot, maze = re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id).groups()
     kwargs = {"robot": robot.lower(), "maze": maze}
-    gym.register(
-        env_id, "mazes:MazeEnv", max_episode_steps=1000, disable_env_checker=True, kwargs=kwargs
-    )
+    options = {"max_episode_steps": 1000, "reward_threshold": 0.9, "disable_env_checker": True}
+    gym.register(env_id, "mazes:MazeEnv", kwargs=kwargs, **options)
 gym.register("door-v0", "environments:make_door", max_episode_steps=200, disable_env_checker=True)
 
 
