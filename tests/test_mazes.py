@@ -342,7 +342,7 @@ def test_model_parameters():
 
 
 def capsule_inertia(density, r, length, old):
-    """Mass, moments about the axis and across: of a cylinder of height length + r (old), or exact."""
+    """Mass, moments about the axis and across it: a cylinder's of height length + r, or exact."""
     if old:
         h = length + r
         mass = density * math.pi * r**2 * h
@@ -415,7 +415,8 @@ def test_point_turns_first_then_moves_and_wraps_its_heading():
 
 
 # In PointUMaze a cell is 4 wide. The robot's cell has faces at x = -1.6, y = -1.6 and y = 1.6
-# (walls at 2, less 0.4); the wall in the middle ends at x = 6 and y = 2, its faces at x = 6.4 and y = 1.6.
+# (walls at 2, less 0.4); the wall in the middle ends at x = 6 and y = 2, its faces are at x = 6.4
+# and y = 1.6.
 REFLECTIONS = {
     "free": ((0, 0), (0.9, 0.3), (0.9, 0.3)),
     "head-on": ((-1, 0), (-2, 0), (-1.28, 0)),  # 0.4 is left at the face; 0.8 of it goes back
