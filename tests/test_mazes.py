@@ -1,6 +1,8 @@
 """The mazes against figures worked out by hand from the original's rules."""
 
+import copy
 import math
+import pickle
 
 import gymnasium as gym
 import mujoco
@@ -38,7 +40,7 @@ def robot_of(env_id):
 
 
 def place(env, x, y, **velocities):
-    """Puts the robot at (x, y), upright and at rest but for the given velocities by coordinate number."""
+    """Puts the robot at (x, y), upright, at rest but for these velocities (v0 of coordinate 0)."""
     env.reset(seed=0)
     mujoco.mj_resetData(env.model, env.data)
     env.data.qpos[:2] = x, y
@@ -47,7 +49,7 @@ def place(env, x, y, **velocities):
 
 
 def walls_of(env_id):
-    """The walls' centers (n, 2), side and height in m, from the compiled model instead of the grid."""
+    """The walls' centers (n, 2), side and height in m, from the compiled model, not the grid."""
     model = make(env_id).model
     walls = [i for i in range(model.ngeom) if model.geom(i).name.startswith("wall")]
     return (
@@ -92,6 +94,7 @@ def test_spaces_and_gymnasium_checks(env_id):
     env = make(env_id)
     check_env(env, skip_render_check=True)
     assert gym.spec(env_id).max_episode_steps == 1000
+    assert gym.spec(env_id).reward_threshold == 0.9  # the original's
     np.testing.assert_array_equal(env.action_space.high, np.float32(high))
     np.testing.assert_array_equal(env.action_space.low, -np.float32(high))
     assert env.action_space.dtype == np.float32
@@ -179,7 +182,11 @@ def test_observation_layout_and_reward(env_id):
         speed = math.dist(obs[:2], before[:2]) / dt
         inner = 0 if env_id.startswith("Point") else speed - 1e-4 * sum(a * a for a in action)
         assert reward == pytest.approx(-0.0001 + 0.01 * inner, rel=1e-9)
-        assert (terminated, truncated, info) == (False, False, {"success": False})
+        assert (terminated, truncated, info["success"]) == (False, False, False)
+        np.testing.assert_array_equal(info.pop("position"), obs[:2])
+        terms = {"reward_forward": speed, "reward_ctrl": -1e-4 * sum(a * a for a in action)}
+        expected = {} if env_id.startswith("Point") else terms  # as in the original
+        assert info == {"success": False, **{k: pytest.approx(v) for k, v in expected.items()}}
         before = obs
 
 
@@ -233,6 +240,59 @@ def test_trajectories_depend_on_seed_and_actions_only(env_id):
     assert abs(second_episode - used.reset(seed=7)[0]).max() > 0.01
 
 
+def through_pickle(env):
+    return pickle.loads(pickle.dumps(env))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, through_pickle])
+@pytest.mark.parametrize("env_id", TASKS)
+def test_copies_go_on_and_start_again_alike(env_id, duplicate):
+    """In mid-episode; the original and the copy do not touch each other."""
+
+    def play(env, n_steps=30):
+        rng = np.random.default_rng(0)
+        high = env.action_space.high
+        steps = [env.step(rng.uniform(-high, high))[:2] for _ in range(n_steps)]
+        return b"".join([obs.tobytes() + np.float64(reward).tobytes() for obs, reward in steps])
+
+    env = gym.make(env_id)
+    env.reset(seed=1)
+    play(env)
+    twin = duplicate(env)
+    assert play(env) == play(twin)
+    assert env.reset()[0].tobytes() == twin.reset()[0].tobytes()  # the generator goes on as well
+    fresh = gym.make(env_id)
+    assert twin.reset(seed=5)[0].tobytes() == fresh.reset(seed=5)[0].tobytes()
+    assert play(twin) == play(fresh)
+
+
+def test_a_copy_renders():
+    env = make("PointUMaze-v1", render_mode="rgb_array")
+    env.reset(seed=1)
+    image = env.render()
+    twin = copy.deepcopy(env)
+    np.testing.assert_array_equal(twin.render(), image)
+    env.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("env_id", ["PointUMaze-v1", "AntUMaze-v1", "SwimmerUMaze-v1"])
+def test_bad_actions_are_refused(env_id):
+    env = make(env_id)
+    before = env.reset(seed=1)[0]
+    n = env.model.nu
+    for action in (np.zeros(n + 1), np.zeros(n - 1), np.zeros((1, n)), np.zeros((n, 1)), 0.5):
+        with pytest.raises(ValueError, match=rf"shape .*, need \({n},\)"):
+            env.step(action)
+    for i in range(n):
+        action = np.zeros(n)
+        action[i] = math.nan
+        with pytest.raises(ValueError, match="NaN"):
+            env.step(action)
+    np.testing.assert_array_equal(env._observation(), before)  # nothing moved
+    env.step([math.inf] * n)  # clipped like any other
+
+
 # --- Robots
 
 
@@ -282,7 +342,7 @@ def test_model_parameters():
 
 
 def capsule_inertia(density, r, length, old):
-    """Mass and moments about the axis and across it: of a cylinder of height length + r (old), or exact."""
+    """Mass, moments about the axis and across it: a cylinder's of height length + r, or exact."""
     if old:
         h = length + r
         mass = density * math.pi * r**2 * h
@@ -354,8 +414,9 @@ def test_point_turns_first_then_moves_and_wraps_its_heading():
     assert env.step([0, 0])[0][0] == pytest.approx(0.2)
 
 
-# In PointUMaze a cell is 4 wide. The robot's cell has faces at x = -1.6, y = -1.6 and y = 1.6 (walls at 2, less 0.4);
-# the wall in the middle ends at x = 6 and y = 2, its faces at x = 6.4 and y = 1.6.
+# In PointUMaze a cell is 4 wide. The robot's cell has faces at x = -1.6, y = -1.6 and y = 1.6
+# (walls at 2, less 0.4); the wall in the middle ends at x = 6 and y = 2, its faces are at x = 6.4
+# and y = 1.6.
 REFLECTIONS = {
     "free": ((0, 0), (0.9, 0.3), (0.9, 0.3)),
     "head-on": ((-1, 0), (-2, 0), (-1.28, 0)),  # 0.4 is left at the face; 0.8 of it goes back
@@ -413,7 +474,7 @@ def test_moves_on_a_face():
 
 
 def test_reflection_faces_of_a_single_wall():
-    """A lone wall, side 2, at the origin of its grid's center has four faces at 1.4 from its center, which meet."""
+    """A lone wall of side 2 has four faces at 1.4 from its center, which meet."""
     cells = read_grid("... .#. R..", 2)  # the wall is at (2, -2)
     faces = sorted(WallReflection(cells, 2).faces)
     expected = [

@@ -1,4 +1,4 @@
-"""Environments that threads step against the same ones without, and make_vector_env's rest."""
+"""Environments that threads step against the same ones without, and other arguments."""
 
 import traceback
 
