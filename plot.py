@@ -553,7 +553,10 @@ def draw_results(args):
     report["averaged though evaluated differently (the mean is the same)"] = (
         analysis.mixed_evaluations(runs)
     )
-    betas = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
+    asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
+    betas = asked or three_betas(grid[~grid.vanilla])
+    others = sorted(set(grid.beta.dropna()) - set(betas))
+    report["not among the learning curves (--beta chooses)"] = [f"beta {b:g}" for b in others]
     todo = results(runs, curves, betas)
     args.out.mkdir(parents=True, exist_ok=True)
     file = args.out / "report.txt"

@@ -291,7 +291,7 @@ def test_labels_of_the_whole_grid_do_not_touch(tmp_path):
         plt.close(fig)
 
 
-def test_three_betas_by_default_and_their_lines_carry_markers(tmp_path):
+def test_three_betas_by_default_and_their_lines_carry_markers(tmp_path, run):
     write_sweep(tmp_path, dict.fromkeys(analysis.STUDY_BETAS, 1), seeds=2)
     runs, curves = analysis.load([tmp_path])
     runs, _ = analysis.select(runs)
@@ -301,6 +301,8 @@ def test_three_betas_by_default_and_their_lines_carry_markers(tmp_path):
         lines = [line for line in fig.axes[0].lines if len(line.get_xdata()) == 4]
         assert [line.get_marker() for line in lines] == [plot.look(b)["marker"] for b in shown]
         plt.close(fig)
+    _, stdout, _ = run("plot.py results", tmp_path, "--out", tmp_path / "figures")
+    assert "not among the learning curves (--beta chooses): 5\n  beta -1\n" in stdout
     assert plot.three_betas(runs[runs.beta.isin([-1, 0.2, 0.5, 2])]) == [-1, 0.2, 0.5]
 
 
