@@ -541,7 +541,7 @@ def frames_per_second(env):
 
 
 def record_video(env, policy, path, seed):
-    """Plays one episode of policy(obs (1, obs_dim)) -> actions (1, action_dim); saves it as .mp4."""
+    """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim); saves it as .mp4."""
     import imageio
 
     path.parent.mkdir(exist_ok=True)

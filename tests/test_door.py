@@ -1,4 +1,4 @@
-"""The Adroit door against D4RL's reward, written out here and computed from the simulator's state."""
+"""The Adroit door against D4RL's reward, written out here, from the simulator's state."""
 
 import subprocess
 import sys
