@@ -124,19 +124,22 @@ def door_class():
     return AdroitDoor
 
 
-class FlatObservations(gym.Wrapper):
-    """Flattens observations into one float32 vector (a Dict in its order of keys); drops infos."""
+class FlatSpaces(gym.Wrapper):
+    """Makes observations (a Dict in its order of keys) and actions one vector; drops the infos."""
 
     def __init__(self, env):
         super().__init__(env)
-        obs_dim = spaces.flatdim(env.observation_space)
+        obs_dim, actions = spaces.flatdim(env.observation_space), env.action_space
         self.observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
+        low, high = actions.low.reshape(-1), actions.high.reshape(-1)
+        self.action_space = spaces.Box(low, high, dtype=actions.dtype)
 
     def reset(self, **kwargs):
         obs, _ = self.env.reset(**kwargs)
         return self._flatten(obs), {}
 
     def step(self, action):
+        action = action.reshape(self.env.action_space.shape)
         obs, reward, terminated, truncated, _ = self.env.step(action)
         return self._flatten(obs), reward, terminated, truncated, {}
 
@@ -189,7 +192,7 @@ def make_env(env_id, max_episode_steps=None, **kwargs):
         raise gym.error.Error(
             f"{env_id} has observations {observations}; the networks need a fixed number of values"
         )
-    return FlatObservations(env)
+    return FlatSpaces(env)
 
 
 def import_module_of(env_id, module):
@@ -321,7 +324,7 @@ class ThreadedVectorEnv(VectorEnv):
             functools.partial(part.reset, seed=part_seeds, options=options)
             for part, part_seeds in zip(self._parts, seeds, strict=True)
         ]
-        obs, _ = self._each(calls)  # FlatObservations drops the infos
+        obs, _ = self._each(calls)  # FlatSpaces drops the infos
         return np.concatenate(obs), {}
 
     def step(self, actions):
@@ -541,7 +544,7 @@ def frames_per_second(env):
 
 
 def record_video(env, policy, path, seed):
-    """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim); saves it as .mp4."""
+    """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim), and saves it."""
     import imageio
 
     path.parent.mkdir(exist_ok=True)
@@ -550,5 +553,6 @@ def record_video(env, policy, path, seed):
     with imageio.get_writer(path, fps=frames_per_second(env), macro_block_size=2) as video:
         while not done:
             video.append_data(env.render())
-            obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])
+            action = np.clip(policy(obs[None])[0], env.action_space.low, env.action_space.high)
+            obs, _, terminated, truncated, _ = env.step(action)
             done = terminated or truncated

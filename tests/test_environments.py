@@ -218,7 +218,7 @@ def test_models_without_textures_move_the_same(task):
     whole = gym.make(f"dm_control/{task}-v0", disable_env_checker=True)
     assert small.unwrapped._env.physics.model.tex_data.nbytes < 1000
     assert whole.unwrapped._env.physics.model.tex_data.nbytes > 10_000_000
-    assert_same(small, environments.FlatObservations(whole))
+    assert_same(small, environments.FlatSpaces(whole))
 
 
 def test_the_door_without_what_is_only_seen_moves_the_same():
