@@ -89,7 +89,7 @@ def run_script(clock, env_id, flags="", n_envs=N_ENVS, evaluations=True):
         timed_keep(*args, **kwargs)
         clock.next_round()
 
-    ppo.silence()
+    ppo.environments.silence()
     ppo.evaluate = clock.timed("evaluation", ppo.evaluate)
     ppo.ColoredNoiseProcess.sample = clock.timed("noise", ppo.ColoredNoiseProcess.sample)
     for name in ("log", "log_rollout", "add_evaluation"):

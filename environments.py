@@ -13,6 +13,7 @@ import io
 import logging
 import math
 import os
+import random
 import re
 import sys
 import tempfile
@@ -51,6 +52,27 @@ def silence_mujoco():
         import mujoco
 
         mujoco.set_mju_user_warning(lambda message: None)
+
+
+def seed_global_generators(seeds):
+    """Seeds `random` and `numpy.random`, which some environments draw from. seeds: two integers."""
+    random.seed(seeds[0])
+    np.random.seed(seeds[1])  # noqa: NPY002
+
+
+@contextlib.contextmanager
+def preserved_generators():
+    """What is drawn within from the global generators is not missing from them afterwards."""
+    torch = sys.modules.get("torch")
+    states = random.getstate(), np.random.get_state()  # noqa: NPY002
+    torch_state = torch and torch.get_rng_state()
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        if torch:
+            torch.set_rng_state(torch_state)
 
 
 # --- The mazes and the Adroit door
@@ -543,6 +565,7 @@ def frames_per_second(env):
     return 1 / dt if dt else env.metadata.get("render_fps") or 30
 
 
+@preserved_generators()
 def record_video(env, policy, path, seed):
     """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim), and saves it."""
     import imageio

@@ -28,9 +28,10 @@ import numpy as np
 import torch
 from torch import nn
 
+import environments
 import run_files
 from colored_noise import ColoredNoiseProcess
-from environments import envpool_has, make_render_env, make_vector_env, record_video, silence
+from environments import make_vector_env
 from run_files import RunFolder, fail, make_seeds, stop_if_asked
 
 
@@ -60,9 +61,7 @@ def parse_args(argv=None, **defaults):
     add("--anneal-lr", action=flag, default=False, help="lower the learning rate linearly to 0")
     add("--gamma", type="fraction", default=0.99, help="discount factor")
     add("--gae-lambda", type="fraction", default=0.95, help="of generalized advantage estimation")
-    add(
-        "--clip-range", type="positive", default=0.2, help="bound on the probability ratio's change"
-    )
+    add("--clip-range", type="positive", default=0.2, help="bound on the ratio's change")
     add("--normalize-advantage", action=flag, default=True, help="to mean 0, std 1 per minibatch")
     add("--ent-coef", type="real", default=0.0, help="weight of the entropy bonus")
     add("--vf-coef", type="real", default=0.5, help="weight of the value loss")
@@ -88,7 +87,7 @@ def parse_args(argv=None, **defaults):
     if args.resume and args.overwrite:
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
     if args.envpool is None:  # a run that is there keeps what it has
-        usable = envpool_has(args.env_id) and args.max_episode_steps is None
+        usable = environments.envpool_has(args.env_id) and args.max_episode_steps is None
         args.envpool = run_files.recorded(args, "envpool", default=usable)
     run_files.check_device(args.device)
     return run_files.Args(**vars(args))
@@ -186,11 +185,11 @@ def collect(agent, act, envs, storage, running, args, bar):
 
     # Only the mean action is needed to act. The log-probabilities and values are computed here, for
     # all steps in one go: much quicker than one by one, and the same, as nothing has learned since.
-    batch_obs, batch_actions = (
-        torch.as_tensor(x, device=args.device).flatten(0, 1) for x in (obs, actions)
-    )
-    logprobs, _, values = agent(batch_obs[: -args.n_envs], batch_actions)
-    last_values = agent.critic(batch_obs[-args.n_envs :]).squeeze(-1).cpu().numpy()
+    batch_obs = torch.as_tensor(obs[:-1], device=args.device).flatten(0, 1)
+    batch_actions = torch.as_tensor(actions, device=args.device).flatten(0, 1)
+    logprobs, _, values = agent(batch_obs, batch_actions)
+    last_obs = torch.as_tensor(obs[-1], device=args.device)
+    last_values = agent.critic(last_obs).squeeze(-1).cpu().numpy()
     if args.bootstrap_timeouts and timeouts:
         # A time limit is not the end of the task: the episode would have gone on from its final
         # observation, and what would have followed is worth V(final observation).
@@ -200,8 +199,7 @@ def collect(agent, act, envs, storage, running, args, bar):
     values_2d = values.view(rewards.shape).cpu().numpy()
     targets = compute_gae(rewards, values_2d, dones, last_values, args.gamma, args.gae_lambda)
     advantages, returns = (torch.as_tensor(x, device=args.device).flatten() for x in targets)
-    batch = (batch_obs[: -args.n_envs], batch_actions, logprobs, advantages, returns, values)
-    return batch, episodes
+    return (batch_obs, batch_actions, logprobs, advantages, returns, values), episodes
 
 
 def compute_gae(rewards, values, dones, last_values, gamma, gae_lambda):
@@ -300,6 +298,7 @@ def learn(agent, optimizer, batch, learning_rate, update, args):
 # --- Evaluating
 
 
+@environments.preserved_generators()  # evaluations must not change what training draws
 def evaluate(policy, envs, seeds, max_steps=20_000):
     """Plays one episode of the policy in each environment: returns and lengths, (n_envs,) each.
 
@@ -330,7 +329,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     # Everything that can fail comes first, before run.start() touches anything of an earlier run
     with run_files.one_line_for(gym.error.Error):
         how = (args.envpool, args.threads, args.max_episode_steps)
-        video_env = make_render_env(args.env_id, how[2]) if args.capture_video else None
+        video_env = environments.make_render_env(args.env_id, how[2]) if args.capture_video else None
         envs = make_vector_env(args.env_id, args.n_envs, *how)
         eval_envs = make_vector_env(args.env_id, args.eval_episodes, *how)
     obs_dim = envs.single_observation_space.shape[0]
@@ -345,10 +344,8 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     torch.manual_seed(init_seed)
     agent = make_agent(obs_dim, action_dim).to(args.device).requires_grad_(False)
     with run_files.one_line_for(MemoryError, RuntimeError, because="not enough memory: "):
-        noise = ColoredNoiseProcess(
-            args.beta, args.n_envs, action_dim, args.noise_seq_len, noise_seed
-        )
-        shape = (args.n_steps, args.n_envs)
+        size, shape = (args.n_envs, action_dim, args.noise_seq_len), (args.n_steps, args.n_envs)
+        noise = ColoredNoiseProcess(args.beta, *size, noise_seed)
         obs = np.zeros((args.n_steps + 1, args.n_envs, obs_dim), np.float32)  # and the next one
         actions = np.zeros((*shape, action_dim), np.float32)
         storage = obs, actions, np.zeros(shape, np.float32), np.zeros(shape, bool)
@@ -366,7 +363,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
         torch.set_rng_state(run.checkpoint["torch_rng"])
         global_step, next_eval = run.checkpoint["global_step"], run.checkpoint["next_eval"]
     # The state of environments cannot be saved in general: after a resume they begin new episodes
-    run_files.seed_global_generators(make_seeds(2, args.seed, 3, global_step))
+    environments.seed_global_generators(make_seeds(2, args.seed, 3, global_step))
     obs[-1], _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
     running, limit = np.zeros((2, args.n_envs)), args.max_episode_steps or 20_000
     steps_per_update = args.n_steps * args.n_envs
@@ -380,22 +377,16 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
             while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
                 if returns is None or not args.eval_once_per_policy:
                     seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
-                    with run_files.preserved_generators():
-                        returns, lengths = evaluate(policy, eval_envs, seeds, limit)
+                    returns, lengths = evaluate(policy, eval_envs, seeds, limit)
                 run.add_evaluation(next_eval, returns, lengths)
                 bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
                 if video_env and run.is_video_due(next_eval):
                     path = run.path / "videos" / f"step_{next_eval}.mp4"
-                    record_video(video_env, policy, path, seeds[0])
+                    environments.record_video(video_env, policy, path, seeds[0])
                 next_eval += args.eval_freq
-            state = {
-                "global_step": global_step,
-                "next_eval": next_eval,
-                "noise": noise.state_dict(),
-            }
-            state |= {"agent": agent.state_dict(), "optimizer": optimizer}
-            state["torch_rng"] = torch.get_rng_state()
-            run.keep(state, write=returns is not None or global_step == total)
+            state = {"agent": agent.state_dict(), "optimizer": optimizer, "next_eval": next_eval}
+            state |= {"noise": noise.state_dict(), "torch_rng": torch.get_rng_state()}
+            run.keep(state, global_step, write=returns is not None or global_step == total)
             if global_step == total:
                 break
 
@@ -417,13 +408,13 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
                 episodes = []
 
     summary = run.finish(global_step)
-    print(f"performance {summary['performance']:.4g}, final {summary['final_return']:.4g}, "
-          f"{global_step:,} steps "
-          f"in {summary['wall_seconds'] / 60:.1f} min: {run.path}")  # fmt: skip
+    print(f"performance {summary['performance']:.4g}, "
+          f"final return {summary['final_return']:.4g}, "
+          f"{summary['wall_seconds'] / 60:.1f} min: {run.path}")  # fmt: skip
 
 
 if __name__ == "__main__":
     loading.cancel()
-    silence()
+    environments.silence()
     run_files.catch_signals()
     main(parse_args())

@@ -14,7 +14,6 @@ import json
 import math
 import os
 import platform
-import random
 import re
 import shutil
 import signal
@@ -181,6 +180,36 @@ def make_seeds(n, *key):
     return np.random.SeedSequence(key).generate_state(n).tolist()
 
 
+def n_cores():
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def recorded(args, name, default):
+    """The argument's value in the config.json of the run that is there already, or the default."""
+    try:
+        config = json.loads((run_path(vars(args)) / "config.json").read_text())
+        return default if args.overwrite else config["args"].get(name, default)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+        return default  # no run, or a damaged one, of which RunFolder speaks
+
+
+def check_device(device):
+    """Ends the program where tensors on this torch device cannot be made and read."""
+    try:
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        fail(f"--device {device} is not available here", code=2)
+
+
+# --- Helpers of the loop
+
+
+def make_seeds(n, *key):
+    """n independent seeds below 2^32, determined by the integers of the key."""
+    return np.random.SeedSequence(key).generate_state(n).tolist()
+
+
 def seed_global_generators(seeds):
     """Seeds `random` and `numpy.random`, which some environments draw from. seeds: two integers."""
     random.seed(seeds[0])
@@ -197,18 +226,6 @@ def prepare_torch():
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp()
-
-
-@contextlib.contextmanager
-def preserved_generators():
-    """What is drawn within from the global generators is not missing from them afterwards."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
 
 
 def check_finite(args, step, **arrays):
@@ -320,7 +337,7 @@ class RunFolder:
     def __init__(self, args):
         args = vars(args)
         self.path, self.checkpoint, self.summary = run_path(args), None, None
-        self._args, self._wandb = args, None
+        self._args, self._wandb, self._state = args, None, None
         self._start_time, self._earlier_seconds, self._written = time.time(), 0.0, 0.0
         if args["track"]:
             with one_line_for(ImportError, because="--track needs pip install wandb: "):
@@ -369,8 +386,9 @@ class RunFolder:
 
     def __exit__(self, kind, error, _):
         if kind and issubclass(kind, Stopped):
-            with self._one_line_errors():
-                self._write_checkpoint()
+            if self._state:  # else it is stopped before anything was learned
+                with self._one_line_errors():
+                    self._write_checkpoint()
             print("stopped: the same command with --resume goes on from here", file=sys.stderr)
 
     def seconds(self):
@@ -417,8 +435,8 @@ class RunFolder:
         scalars["length_mean"] = lengths.mean()
         self.log(step, {f"evaluation/{name}": value for name, value in scalars.items()})
 
-    def keep(self, state, write):
-        """Keeps `state`, a dict of tensors and plain values, to resume from.
+    def keep(self, state, step, write):
+        """Keeps `state`, a dict of tensors and plain values, to resume from at this step.
 
         It is written to checkpoint.pt where `write` says so, every few seconds, and on a signal.
         """
@@ -427,7 +445,8 @@ class RunFolder:
                 self._append(self._events_name, self._buffer.getvalue())
                 self._buffer.seek(0)
                 self._buffer.truncate()
-            self._state = {**state, "file_sizes": self._sizes.copy()}
+            sizes = self._sizes.copy()
+            self._state = {**state, "global_step": step, "file_sizes": sizes}
             if write or time.time() > self._written + SECONDS_BETWEEN_CHECKPOINTS:
                 self._write_checkpoint()
 

@@ -33,7 +33,8 @@ def run_forked(script, argv, folder, timeout):
         try:
             for fd, path in ((1, out), (2, err)):
                 os.dup2(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND), fd)
-            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+            sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+            sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
             sys.argv = [str(script), *argv]
             runpy.run_path(str(script), run_name="__main__")
             code = 0

@@ -3,6 +3,7 @@
 An edit is a list of (old line, new line). The copy is run; the tests look at what it left behind.
 """
 
+import ast
 import importlib.util
 import sys
 
@@ -207,3 +208,31 @@ def test_the_module_is_what_counts(tmp_path):
     freeze = "            agent.log_std.data = torch.full((1,), -2.0)\n"
     agent, *_ = run(edit(tmp_path, (line, freeze + line)), tmp_path, "--no-compile --n-epochs 1")
     assert agent.log_std.item() == pytest.approx(-2, abs=0.1)  # one update away
+
+
+def nesting(node, depth=0):
+    blocks = (ast.For, ast.While, ast.If, ast.With, ast.Try, ast.FunctionDef)
+    deeper = depth + isinstance(node, blocks)
+    return max([deeper, *(nesting(child, deeper) for child in ast.iter_child_nodes(node))])
+
+
+def test_the_script_stays_readable():
+    """The house rules: lines, length of functions, nesting, and no name used before it is there."""
+    text = SCRIPT.read_text()
+    assert text.count("\n") <= 425 and max(map(len, text.splitlines())) <= 100
+    for function in ast.walk(ast.parse(text)):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        length = function.end_lineno - function.lineno + 1
+        assert length <= 60 or function.name in ("main", "parse_args"), function.name
+        assert max(nesting(node) for node in function.body) <= 4, function.name
+        inner = [node for node in ast.walk(function) if isinstance(node, ast.FunctionDef)][1:]
+        for nested in inner:
+            names = {node.id for node in ast.walk(nested) if isinstance(node, ast.Name)}
+            later = {
+                node.id
+                for node in ast.walk(function)
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+                if node.lineno > nested.end_lineno
+            }
+            assert not names & later, f"{nested.name} in {function.name}"

@@ -336,7 +336,8 @@ def test_unwritable_folder(train, tmp_path):
 
 def test_full_disk_loses_nothing(train, tiny, tmp_path):
     """A limit on the size of files stands in for a full disk: both are an OSError in mid-write."""
-    full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731  less than a checkpoint
+    size = 20_000  # less than a checkpoint
+    full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))  # noqa: E731
     process = start(tmp_path, tiny)
     wait_for_rows(tmp_path, 3, process)
     process.kill()
@@ -549,11 +550,17 @@ def test_faults_of_the_environment_keep_their_traceback(train, tiny, mine, what,
     assert "my_env.py" in process.stderr and "--resume" not in process.stderr
 
 
-def test_a_swallowed_signal_stops_all_the_same(train, tiny, tmp_path, mine):
-    process = train(f"{tiny} --env-id my_env:Mine-signal-v0")
+@pytest.mark.parametrize("in_evaluation", [False, True])
+def test_a_swallowed_signal_stops_all_the_same(train, tiny, tmp_path, mine, in_evaluation):
+    flags = "--eval-freq 128" if in_evaluation else ""  # the second of the first policy
+    process = train(f"{tiny} --env-id my_env:Mine-signal-v0 {flags}")
     assert process.returncode == 143 and "--resume" in process.stderr
-    checkpoint = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)
-    assert checkpoint["global_step"] == 0
+    assert "Traceback" not in process.stderr
+    if in_evaluation:
+        assert len(read_evaluations(only_run(tmp_path))) == 1
+    else:
+        checkpoint = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)
+        assert checkpoint["global_step"] == 0
 
 
 def test_a_second_signal_ends_at_once(tiny, tmp_path, mine):
