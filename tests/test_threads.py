@@ -39,6 +39,15 @@ def test_threads_change_nothing(env_id, threads):
     threaded.close()
 
 
+def test_wrong_numbers_of_actions_and_seeds_are_refused():
+    envs = make_vector_env("PointUMaze-v1", 4, threads=2)
+    for n in (3, 5):
+        with pytest.raises(ValueError, match=f"{n} values for 4 environments"):
+            envs.reset(seed=list(range(n)))
+        with pytest.raises(ValueError, match=f"{n} values for 4 environments"):
+            envs.step(np.zeros((n, 2), np.float32))
+
+
 def test_only_mujoco_is_threaded():
     for env_id in ("Pendulum-v1", "dm_control/pendulum-swingup-v0"):
         assert not isinstance(make_vector_env(env_id, 4, threads=2), ThreadedVectorEnv)
