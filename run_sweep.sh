@@ -1,74 +1,67 @@
 #!/usr/bin/env bash
-# Grids of runs, on local cores or on a Slurm cluster; usage() says how to use it.
+# Runs the paper's grids: each run in a process of its own on one core, resumable, none done twice.
 #
-# There is no queue and no database: a run's state is what lies in its folder. summary.json: it is
-# complete. failed: it failed, with this exit code. A flock on log.txt: a worker has it (the run's
-# output goes there, so the lock lives as long as a process that writes to it). A flock on lock: a
-# training process works on it. A sweep is N workers, each of which walks through the list of runs
-# and does those that are free: two sweeps share the work as two workers do.
+# usage: run_sweep.sh PRESET [what to run] [how to run it] [-- FLAGS FOR EVERY RUN]
+#
+# presets, each the paper's experiment as it was (dm_control without bootstrap at time limits)  runs
+#   quick     Mountain Car, beta 0 and 0.5, n_envs 4, seeds 1 and 2: minutes                       4
+#   main      the study: 16 environments x 8 betas x n_envs 1, 2, 4, ..., 128 x 20 seeds       20480
+#   vanilla   the Vanilla column: white noise from torch's own generator, else as main          2560
+#   n_steps   n_envs 2, 4, 8 with n_steps 4096, 2048, 1024 (update size 8192), beta 0.5          960
+#   n_epochs  5, 10 and 20 epochs, beta 0.2, 0.5 and 0.75, n_envs 4                             2880
+#   complex   PointPush, AntPush, PointPushMaze and AntPushMaze, 8 betas, n_envs 4               640
+#   transfer  TRPO and A2C (baselines.py), 16 environments, 8 betas, n_envs 4                   5120
+#   gsde      gSDE (baselines.py) in place of colored noise, 16 environments, n_envs 1 to 128   2560
+# what to run, quoted lists in place of the preset's
+#   --envs "A B"        environments: those below (cheetah-run is short for
+#                       dm_control/cheetah-run-v0), or any id of the form NAME-v0 or MODULE:NAME
+#   --betas "0 0.5"     noise colors; likewise --n-envs "4 8", --seeds "1 2 3", and, only in the
+#                       preset n_epochs, --n-epochs "5 20"
+#   --exp-name NAME     the experiment, a folder in the runs folder (ppo_colored_continuous; trpo,
+#                       a2c, gsde). n_steps and n_epochs add _n_steps_1024 and the like to it.
+#   --runs-dir FOLDER   where the runs are (runs); on a cluster, a folder that all nodes share
+#   -- FLAGS            handed to every run as they are, as in "-- --device cpu". Flags that change
+#                       the result, as in "-- --learning-rate 1e-4", need an --exp-name of their
+#                       own: they do not show in the path.
+# how to run it
+#   -j N                N runs at a time on this machine (as many as it has cores)
+#   --print             print one command per line and nothing else, for GNU parallel or a queue
+#   --status            say how many are done, running, failed and to do, and the time left
+#   --slurm             submit what is to do as job arrays
+#   --sbatch "OPTIONS"  handed to sbatch: "--partition=cpu --time=12:00:00 --mem-per-cpu=2G"; with
+#                       --cpus-per-task=8 a task does its runs 8 at a time
+#   --runs-per-task K   runs in a task of the array (4; 1 for the ant, which takes over an hour)
+#   --retry-failed      take up failed runs again, from their last checkpoint
+#
+# PYTHON names the interpreter (python), as in PYTHON=.venv/bin/python ./run_sweep.sh quick
+# Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was. The same
+# command on a second machine with that runs folder shares the work. A run's output is in log.txt
+# in its folder. A failed run has its exit code in the file "failed" there, and is not tried again
+# without --retry-failed.
+# Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
+
 # shellcheck disable=SC2015,SC2086,SC2206,SC2317  # lists of words stand without quotes on purpose
-((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash is too old: 4.4" >&2; exit 2; }
+((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash is older than 4.4" >&2; exit 2; }
 set -ufo pipefail # -f: words with * and ? stay as they are
 unset LC_ALL
 export LC_NUMERIC=C # a decimal point in numbers
 
 study_envs=$(echo MountainCarContinuous-v0 dm_control/cartpole-{balance,swingup}_sparse-v0 \
   dm_control/{ball_in_cup-catch,hopper-hop,cheetah-run,walker-run,reacher-hard}-v0 \
-  dm_control/pendulum-swingup-v0 door-v0 {PointUMaze,AntUMaze,Point4Rooms,SwimmerUMaze,Swimmer4Rooms,Ant4Rooms}-v1)
+  dm_control/pendulum-swingup-v0 door-v0 {PointUMaze,AntUMaze,Point4Rooms}-v1 \
+  {SwimmerUMaze,Swimmer4Rooms,Ant4Rooms}-v1)
 complex_envs="PointPush-v1 AntPush-v1 PointPushMaze-v1 AntPushMaze-v1"
 all_n_envs="1 2 4 8 16 32 64 128"
-
-usage() {
-  fold -sw 100 <<END
-Runs the paper's grids: each run in a process of its own on one core, resumable, none done twice.
-
-usage: run_sweep.sh PRESET [what to run] [how to run it] [-- FLAGS FOR EVERY RUN]
-
-presets, each the paper's experiment as it was (dm_control without bootstrap at time limits)  runs
-  quick     Mountain Car, beta 0 and 0.5, n_envs 4, seeds 1 and 2: minutes                       4
-  main      the study: 16 environments x 8 betas x n_envs 1, 2, 4, ..., 128 x 20 seeds       20480
-  vanilla   the Vanilla column: white noise from torch's own generator, else as main          2560
-  n_steps   n_envs 2, 4, 8 with n_steps 4096, 2048, 1024 (update size 8192), beta 0.5          960
-  n_epochs  5, 10 and 20 epochs, beta 0.2, 0.5 and 0.75, n_envs 4                             2880
-  complex   PointPush, AntPush, PointPushMaze and AntPushMaze, 8 betas, n_envs 4               640
-  transfer  TRPO and A2C (baselines.py), 16 environments, 8 betas, n_envs 4                   5120
-  gsde      gSDE (baselines.py) in place of colored noise, 16 environments, n_envs 1 to 128   2560
-what to run, quoted lists in place of the preset's
-  --envs "A B"        environments: those below (cheetah-run is short for
-                      dm_control/cheetah-run-v0), or any id of the form NAME-v0 or MODULE:NAME
-  --betas "0 0.5"     noise colors; likewise --n-envs "4 8", --seeds "1 2 3", and, only in the
-                      preset n_epochs, --n-epochs "5 20"
-  --exp-name NAME     the experiment, a folder in the runs folder (ppo_colored_continuous; trpo,
-                      a2c, gsde). n_steps and n_epochs add _n_steps_1024 and the like to it.
-  --runs-dir FOLDER   where the runs are (runs); on a cluster, a folder that all nodes share
-  -- FLAGS            handed to every run as they are, as in "-- --device cpu". Flags that change
-                      the result, as in "-- --learning-rate 1e-4", need an --exp-name of their
-                      own: they do not show in the path.
-how to run it
-  -j N                N runs at a time on this machine (as many as it has cores)
-  --print             print one command per line and nothing else, for GNU parallel or a queue
-  --status            say how many are done, running, failed and to do, and the time left
-  --slurm             submit what is to do as job arrays
-  --sbatch "OPTIONS"  handed to sbatch: "--partition=cpu --time=12:00:00 --mem-per-cpu=2G"; with
-                      --cpus-per-task=8 a task does its runs 8 at a time
-  --runs-per-task K   runs in a task of the array (4; 1 for the ant, which takes over an hour)
-  --retry-failed      take up failed runs again, from their last checkpoint
-
-PYTHON names the interpreter (python), as in PYTHON=.venv/bin/python ./run_sweep.sh quick
-Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was. The same
-command on a second machine with the same runs folder shares the work. A run's output is in log.txt
-in its folder. A failed run has its exit code in the file "failed" there, and is not tried again
-without --retry-failed.
-Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
-
-environments: $study_envs $complex_envs
-END
-  exit
-}
 
 die() { # message, exit code (2: wrong usage)
   echo "run_sweep.sh: $1" >&2
   exit "${2:-2}"
+}
+
+usage() { # the comment at the top
+  sed '1d; /^$/,$d; s/^# \{0,1\}//' "$0" &&
+    fold -sw 100 <<<"environments: $study_envs $complex_envs"
+  exit
 }
 
 full_id() { # the id behind a short name such as cheetah-run, and any other id as it is
@@ -102,8 +95,7 @@ parse_args() {
   while shift && (($#)); do
     case $1 in
       --print | --status | --slurm)
-        [[ $mode == local || --$mode == "$1" ]] || die "choose one of --print, --status, --slurm"
-        mode=${1#--}
+        [[ $mode == local || --$mode == "$1" ]] && mode=${1#--} || die "$1 and --$mode: choose one"
         ;;
       --retry-failed) retry_failed=yes ;;
       -h | --help) usage ;;
@@ -128,12 +120,12 @@ parse_args() {
 # All runs of the sweep: folders[i] and commands[i]. Seeds come outermost, so that a sweep cut short
 # has whole grids.
 list_runs() {
-  local word envs='' seed env n beta epochs method script exp_name name noise flags timeouts start end
+  local word envs='' exp_name=${option[--exp-name]-} start end
+  local seed env n beta epochs method script name noise flags timeouts
   local -A seen=()
   for word in ${option[--envs]}; do
     envs+=" $(full_id "$word")" || die "--envs: '$word' is no environment (--help lists them)"
   done
-  exp_name=${option[--exp-name]-}
   printf -v start '%q %q/' "$python" "$scripts"
   printf -v end ' %q' --runs-dir "$runs_dir" --threads 1 --resume "${run_flags[@]}"
   for seed in ${option[--seeds]}; do for env in $envs; do for n in ${option[--n-envs]}; do
@@ -145,7 +137,8 @@ list_runs() {
         vanilla) noise=vanilla flags=" --vanilla" ;;
         gsde) noise=gsde flags='' ;;
         *)
-          printf -v beta %g "$beta" && [[ $beta != -0 ]] || beta=0
+          printf -v beta %g "$beta"
+          [[ $beta != -0 ]] || beta=0
           noise=beta_$beta flags=" --beta $beta"
           ;;
       esac
@@ -191,6 +184,10 @@ halt() { # problem: ends a worker, and by it the whole sweep
   exit
 }
 
+# There is no queue and no database: a run's state is what lies in its folder. summary.json: it is
+# complete. failed: it failed. A flock on log.txt: a worker has it (the run's output goes there, so
+# the lock lives as long as a process that writes to it). A flock on lock: a process trains. Each
+# worker goes through the list and does what is free: two sweeps share the work as two workers do.
 worker() { # does those of the runs `free` that are still free, one after the other
   local run folder try code reason
   trap 'stopping=yes' TERM
@@ -221,8 +218,7 @@ worker() { # does those of the runs `free` that are still free, one after the ot
   done
 }
 
-# Starts workers until nothing is left. Waits for runs that other processes have: these may die
-work() {
+work() { # starts workers until nothing is left; waits for runs of other processes: these may die
   local i n_left n_waiting='' free
   while [[ -z $stopping ]]; do
     n_left=0 free=()
@@ -253,12 +249,9 @@ stop() { # exit code: ends the runs, which save what they have; the second time 
 report() { # lists what failed, and counts; true where all runs are complete
   local folder complete=0 failed=0
   for folder in "${folders[@]}"; do
-    if [[ -e $folder/summary.json ]]; then
-      complete=$((complete + 1))
-    elif [[ -e $folder/failed ]]; then
-      failed=$((failed + 1))
-      echo "failed with exit code $(<"$folder/failed"): $folder: $(last_line "$folder")"
-    fi
+    [[ -e $folder/summary.json ]] && complete=$((complete + 1)) && continue
+    [[ -e $folder/failed ]] && failed=$((failed + 1)) || continue
+    echo "failed with exit code $(<"$folder/failed"): $folder: $(last_line "$folder")"
   done
   ((failed == 0)) || echo "all they said is in log.txt there; --retry-failed takes them up again"
   echo "$preset: $complete of ${#folders[@]} runs are complete, $failed failed"
@@ -267,21 +260,20 @@ report() { # lists what failed, and counts; true where all runs are complete
 
 # Packs what is left into tasks, writes these to a file in the runs folder, and submits job arrays
 submit() {
-  local i dir batch job first last weight load=0 task=-1 n_left=0 ids='' max
+  local i dir batch job max first last weight load=0 task=-1 ids=''
   local capacity=${option[--runs-per-task]:-4}
   max=$(scontrol show config | awk '$1 == "MaxArraySize" { print $3 }')
   [[ -n $max ]] || die "--slurm: scontrol does not tell MaxArraySize: is this a Slurm cluster?" 1
   dir=$runs_dir/slurm/$(date +%Y%m%d_%H%M%S)_${preset}_$$
   mkdir -p "$dir" || exit 1
   for i in "${!folders[@]}"; do
-    is_left "${folders[i]}" && n_left=$((n_left + 1)) || continue
-    weight=1
+    is_left "${folders[i]}" && weight=1 || continue
     [[ -n ${option[--runs-per-task]-} || ${commands[i]} != *" Ant"* ]] || weight=$capacity
     (((load += weight) <= capacity && task >= 0)) || task=$((task + 1)) load=$weight
     printf '%s\t%s\t%s\n' "$task" "${folders[i]}" "${commands[i]}"
   done >"$dir/tasks" || exit 1
-  ((n_left)) || { echo "$preset: nothing to do" && return; }
-  echo "$n_left runs in $((task + 1)) tasks, whose messages will be in $dir" || exit 1
+  ((task >= 0)) || { echo "$preset: nothing to do" && return; }
+  echo "$(wc -l <"$dir/tasks") runs in $((task + 1)) tasks; their messages: $dir" || exit 1
   printf -v batch '%q ' "PYTHON=$python" "$scripts/run_sweep.sh" --task "$runs_dir" "$dir/tasks"
   for ((first = 0; first <= task; first += max)); do
     last=$((task - first < max ? task - first : max - 1))
@@ -296,14 +288,13 @@ submit() {
 }
 
 main() {
-  local number folder command status error problem='' stopping='' folders=() commands=()
+  local folder status error problem='' stopping='' folders=() commands=()
   local python=${PYTHON:-python} scripts=${0%/*}
   local -A option=()
   if [[ ${1-} == --task ]]; then # a task of submit(): --task RUNS_DIR FILE NUMBER
     mode=task preset="task $4" runs_dir=$2 jobs=${SLURM_CPUS_PER_TASK:-1} retry_failed=''
-    while IFS=$'\t' read -r number folder command; do
-      [[ $number != "$4" ]] || folders+=("$folder") commands+=("$command")
-    done <"$3"
+    mapfile -t folders < <(awk -F '\t' "\$1 == $4 { print \$2 }" "$3")
+    mapfile -t commands < <(awk -F '\t' "\$1 == $4 { print \$3 }" "$3")
   else
     parse_args "$@"
     runs_dir=${option[--runs-dir]%/} jobs=${option[-j]-}
@@ -336,10 +327,9 @@ main() {
   [[ $mode != task ]] || trap 'stop requeue' USR1
   work
   report && exit
-  if [[ $stopping == requeue ]]; then
-    scontrol requeue "${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"
-    exit
-  fi
+  # The job id alone would be the whole array's, in its last task
+  [[ $stopping != requeue ]] ||
+    { scontrol requeue "${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"; exit; }
   [[ $mode == task ]] || echo "to go on:$(printf ' %q' ${PYTHON:+"PYTHON=$PYTHON"} "$0" "$@")"
   exit "${stopping:-1}"
 }

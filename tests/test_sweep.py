@@ -15,6 +15,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -34,6 +35,12 @@ import os, sys, time
 if "--help" not in sys.argv:
     folder = os.path.dirname(os.readlink("/proc/self/fd/1"))
     exec(os.environ["FAKE_RUN"])
+"""
+# What the second start of a run finishes, and the first one does not before there is a file "go"
+ONCE_MORE = """
+if open(folder + "/log.txt").read().count("== ") == 1:
+    while not os.path.exists(folder + "/go"):
+        time.sleep(0.1)
 """
 FINISH = "print('{\"wall_seconds\": 9}', file=open(folder + '/summary.json', 'w'))"
 # Makes stdin the terminal that Ctrl-C comes from, and becomes the command
@@ -539,6 +546,10 @@ def slurm():
     if shutil.which("sinfo") is None or subprocess.run(command, capture_output=True).returncode:
         assert os.environ.get("REQUIRE_SLURM") != "1", "REQUIRE_SLURM=1, but no Slurm answers"
         pytest.skip("no Slurm answers (tests/slurm.sh starts one)")
+    # One test at a time: the node is too small for the tasks of two
+    with open(Path(tempfile.gettempdir()) / "slurm_tests.lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def submit(tiny, *args):
@@ -555,32 +566,45 @@ def queued(*jobs):
 
 
 def test_slurm_arrays_complete(slurm, tmp_path):
-    tiny = Tiny(tmp_path / "runs", seeds="1 2 3 4 5", steps=1024)
+    tiny = Tiny(tmp_path / "runs", seeds="1 2 3 4 5")
+    tiny.fake(FINISH)
     config = subprocess.run(["scontrol", "show", "config"], capture_output=True, text=True).stdout
     max_array_size = int(re.search(r"MaxArraySize\s*= (\d+)", config)[1])
     jobs = submit(tiny, "--runs-per-task", "2")
     assert len(jobs) == -(-3 // max_array_size)
     wait_for(lambda: not queued(*jobs))
-    tiny.assert_complete()
     assert [starts(folder) for folder in tiny.folders] == [1] * 5
+    assert tiny.status() == "quick: 5 of 5 done, 0 running, 0 failed, 0 to do"
     assert "nothing to do" in tiny.run("--slurm").stdout
 
 
 def test_slurm_requeue_and_scancel(slurm, tmp_path):
-    tiny = Tiny(tmp_path / "runs", betas="0 0.5", steps=12288)
+    tiny = Tiny(tmp_path / "runs", betas="0 0.5")
+    tiny.fake(ONCE_MORE + FINISH)
     requeued, cancelled = tiny.folders
     (job,) = submit(tiny, "--runs-per-task", "1")
-    wait_for(lambda: evaluations(requeued))
-    config = (requeued / "config.json").stat().st_mtime_ns
+    wait_for(lambda: all((folder / "log.txt").exists() for folder in tiny.folders))
     subprocess.run(["scontrol", "requeue", f"{job}_0"], check=True)
-    wait_for(lambda: evaluations(cancelled))
     subprocess.run(["scancel", f"{job}_1"], check=True)
     wait_for(lambda: not queued(job), 300)
-    assert (requeued / "summary.json").exists() and starts(requeued) == 2
-    assert (
-        requeued / "config.json"
-    ).stat().st_mtime_ns == config  # it went on and did not start again
+    assert [starts(folder) for folder in tiny.folders] == [2, 1]
     assert tiny.status().startswith("quick: 1 of 2 done, 0 running, 0 failed, 1 to do")
-    assert evaluations(cancelled)
-    assert tiny.run("-j", "1").returncode == 0
-    tiny.assert_complete()
+    assert tiny.run("-j", "1").returncode == 0  # takes up the cancelled one
+
+
+@pytest.mark.parametrize("task", [0, 1])
+def test_slurm_time_limit_requeues_only_the_task(slurm, tmp_path, task):
+    tiny = Tiny(tmp_path / "runs", betas="0 0.5")
+    tiny.fake(ONCE_MORE + FINISH)
+    signalled, other = tiny.folders[task], tiny.folders[1 - task]
+    (job,) = submit(tiny, "--runs-per-task", "1")
+    wait_for(lambda: all((folder / "log.txt").exists() for folder in tiny.folders))
+    # What Slurm sends to the batch shell two minutes before the time limit. The last task of an
+    # array has the array's own job id
+    subprocess.run(["scancel", "--batch", "--signal=USR1", f"{job}_{task}"], check=True)
+    wait_for(lambda: (signalled / "summary.json").exists())
+    assert [starts(signalled), starts(other)] == [2, 1]
+    (other / "go").touch()
+    wait_for(lambda: not queued(job))
+    assert tiny.status() == "quick: 2 of 2 done, 0 running, 0 failed, 0 to do"
+    assert starts(other) == 1
