@@ -41,7 +41,7 @@
 # Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
 
 # shellcheck disable=SC2015,SC2086,SC2206,SC2317  # lists of words stand without quotes on purpose
-((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash is older than 4.4" >&2; exit 2; }
+((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash 4.4 is needed" >&2; exit 2; }
 set -ufo pipefail # -f: words with * and ? stay as they are
 unset LC_ALL
 export LC_NUMERIC=C # a decimal point in numbers
@@ -76,7 +76,7 @@ parse_args() {
   local word words n='[1-9][0-9]{0,8}'
   local -A allowed=([--envs]='[A-Za-z0-9_./:-]+' [--betas]='-?([0-9]+\.?[0-9]*|\.[0-9]+)'
     [--n-envs]=$n [--seeds]="0|$n" [--n-epochs]=10 [--exp-name]='[A-Za-z0-9_][A-Za-z0-9._-]*'
-    [--runs-dir]='[^-].*' [-j]=$n [--sbatch]='.*' [--runs-per-task]=$n)
+    [--runs-dir]='[^-[:cntrl:]][^[:cntrl:]]*' [-j]=$n [--sbatch]='.*' [--runs-per-task]=$n)
   option=([--envs]=$study_envs [--betas]="-1 0 0.2 0.5 0.75 1 1.25 2" [--n-envs]=4
     [--seeds]=$(echo {1..20}) [--n-epochs]=10 [--runs-dir]=runs)
   preset=${1-} mode=local retry_failed='' methods=ppo run_flags=()
@@ -289,8 +289,9 @@ submit() {
 
 main() {
   local folder status error problem='' stopping='' folders=() commands=()
-  local python=${PYTHON:-python} scripts=${0%/*}
+  local python=${PYTHON:-python} scripts
   local -A option=()
+  scripts=$(dirname "$0")
   if [[ ${1-} == --task ]]; then # a task of submit(): --task RUNS_DIR FILE NUMBER
     mode=task preset="task $4" runs_dir=$2 jobs=${SLURM_CPUS_PER_TASK:-1} retry_failed=''
     mapfile -t folders < <(awk -F '\t' "\$1 == $4 { print \$2 }" "$3")

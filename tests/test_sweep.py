@@ -50,6 +50,7 @@ fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 os.execv(sys.argv[1], sys.argv[1:])
 """
 
+submitted = []  # Slurm jobs
 started = []
 
 
@@ -203,7 +204,13 @@ def test_other_methods(tmp_path):
     ]
 
 
-def test_any_environment(tmp_path):
+def test_started_by_bash():
+    command = ["bash", "run_sweep.sh", "quick", "--print", "--seeds", "1", "--betas", "0"]
+    line = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=ENV).stdout
+    assert line.split()[1] == "./ppo_colored_continuous.py"
+
+
+def test_any_environment():
     envs = "cheetah-run dm_control/cheetah-run Ant4Rooms HalfCheetah-v5 my_env:Mine my_env:Mine-v0"
     words = [
         shlex.split(x) for x in printed("quick", "--envs", envs, "--betas", "0", "--seeds", "1")
@@ -336,7 +343,19 @@ def test_interpreter_is_tried_before_anything_starts(tmp_path):
 
 @pytest.mark.parametrize("tool", ["nproc", "flock"])
 def test_missing_tool_is_named(tmp_path, tool):
-    for name in ["bash", "env", "mkdir", "rm", "tail", "tr", "awk", "true", "nproc", "flock"]:
+    for name in [
+        "bash",
+        "env",
+        "dirname",
+        "mkdir",
+        "rm",
+        "tail",
+        "tr",
+        "awk",
+        "true",
+        "nproc",
+        "flock",
+    ]:
         if name != tool:
             (tmp_path / name).symlink_to(shutil.which(name))
     tiny = Tiny(tmp_path / "runs")
@@ -550,13 +569,16 @@ def slurm():
     with open(Path(tempfile.gettempdir()) / "slurm_tests.lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
+        subprocess.run(["scancel", *submitted], check=True)  # what a failed test has left
+        submitted.clear()
 
 
 def submit(tiny, *args):
     """Submits, and returns the numbers of the jobs."""
     result = tiny.run("--slurm", *args)
     assert result.returncode == 0, result.stderr
-    return re.search("as job ([0-9 ]+);", result.stdout)[1].split()
+    submitted.extend(re.search("as job ([0-9 ]+);", result.stdout)[1].split())
+    return list(submitted)
 
 
 def queued(*jobs):
