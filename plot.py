@@ -242,11 +242,12 @@ def compare(runs, x, cells, by=None):
     chosen = chosen.assign(z=analysis.standardize(chosen))
     xlabel = {"beta": BETA_NAMED, "update_size": "update size n_envs \u00b7 n_steps"}.get(x, x)
     fig, [ax] = panels(1, xlabel, STANDARDIZED, height=3)
-    lines = []
+    lines, unknown = [], False
     for i, (value, group) in enumerate(chosen.groupby(by) if by else [("", chosen)]):
         gray = ["0.1", "0.65", "0.4", "0.75"][i % 4] if by else INK
         style = {"color": gray, "ls": ["-", "--", ":", "-."][i % 4], "lw": 1}
         table = analysis.cells_intervals(group, "z", x, cells)
+        unknown |= table.low.isna().any()
         if x == "beta":
             draw_betas(ax, table, shift=0.006 * i, **style)
         else:
@@ -254,7 +255,8 @@ def compare(runs, x, cells, by=None):
             draw_intervals(ax, table.index * 2 ** (0.08 * i), table, **style)
             log2_ticks(ax, chosen[x])
         lines.append((value if isinstance(value, str) else f"{by} = {value}", style))
-    ax.set_title(extent(chosen, runs))
+    no_interval = "\n(no interval where a cell has one run)" * bool(unknown)
+    ax.set_title(extent(chosen, runs) + no_interval)
     if by:
         legend_above(fig, *lines)
     return fig
