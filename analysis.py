@@ -33,7 +33,6 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None
-    import msvcrt
 
 STUDY_BETAS = [-1, 0, 0.2, 0.5, 0.75, 1, 1.25, 2]
 # The study's protocol (Sec. A5); also, bootstrap_timeouts is off for dm_control and on for the rest
@@ -750,6 +749,8 @@ def is_locked(file):
             if fcntl:  # shared, so that two who look do not see each other
                 fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             else:
+                import msvcrt
+
                 msvcrt.locking(lock.fileno(), msvcrt.LK_NBLCK, 1)
                 msvcrt.locking(lock.fileno(), msvcrt.LK_UNLCK, 1)
         except OSError:

@@ -1,19 +1,23 @@
-"""How long a training step takes, and what it is made of: this script beside other ways to run the same protocol.
+"""How long a training step takes, and what it is made of: this script beside its peers.
 
     pip install -r requirements.txt -r tests/requirements.txt && python benchmark.py
 
-Every contender trains with the paper's settings (4 environments, 8,192 steps per update) and evaluates 50 episodes, in
-a process of its own. All are held on one core, since that is what a run has in a sweep that keeps every core busy
-(EnvPool steps in a second thread). They take turns: a round is one update and one evaluation of each. The table has
-medians over rounds in microseconds per training step, evaluations weighted as in the protocol (one per 10,240 steps).
-The first round is not counted; start-up is the time until it begins: imports, making environments, torch.compile (which
-takes longer the first time on a machine). Policies are as they are after a few updates. "files" is logging,
-evaluations.csv and checkpoints. Bare physics is the simulator alone, called from Python: as many control steps as the
-protocol has, with random actions in training and none in evaluation.
+Every contender trains with the paper's settings (4 environments, 8,192 steps per update) and
+evaluates 50 episodes, in a process of its own. All are held on one core, since that is what a run
+has in a sweep that keeps every core busy. They take turns: a round is one update and one evaluation
+of each. The table has medians over rounds in microseconds per training step, evaluations weighted
+as in the protocol (one per 10,240 steps). The first round is not counted: torch.compile is in it.
+Start-up is the time until it begins. Policies are as they are after a few updates. "files" is
+logging, evaluations.csv and checkpoints. Bare physics is the simulator alone, called from Python:
+as many control steps as the protocol has, with random actions in training, none in evaluation.
+
+A second table has the training alone by number of environments, a third one run by number of
+threads, no longer held on one core.
 """
 
 import argparse
 import functools
+import importlib.util
 import multiprocessing
 import os
 import resource
@@ -26,8 +30,16 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 N_ENVS, N_STEPS, STEPS = 4, 2048, 8192  # environments, steps in each per update, steps per round
 EVAL_FREQ, EVAL_EPISODES = 10_240, 50
-LEARNING_RATE, GAMMA, GAE_LAMBDA, CLIP_RANGE, BATCH_SIZE, N_EPOCHS = 2.5e-4, 0.99, 0.95, 0.2, 128, 10
+LEARNING_RATE, GAMMA, GAE_LAMBDA, CLIP_RANGE, BATCH_SIZE, N_EPOCHS = (
+    2.5e-4,
+    0.99,
+    0.95,
+    0.2,
+    128,
+    10,
+)
 PHASES = ["rollout", "noise", "update", "files", "evaluation"]
+CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
 PAPER, PHYSICS = "the paper's stack", "bare physics"
 
 
@@ -46,7 +58,7 @@ class Clock:
         return previous
 
     def timed(self, phase, function):
-        """The same function; its time is this phase's, and not that of the phase it is called in."""
+        """The same function; its time is this phase's, not that of the phase it is called in."""
 
         def timed_function(*args, **kwargs):
             previous = self.switch(phase)
@@ -57,9 +69,11 @@ class Clock:
         return timed_function
 
     def next_round(self):
-        """Reports the seconds since the last call and the peak memory, waits for its turn, and begins a rollout."""
+        """Reports seconds and peak memory since the last call, waits, and begins a rollout."""
         self.switch(None)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+            2**20 if sys.platform == "darwin" else 2**10
+        )
         self.pipe.send({**{phase: self.seconds[phase] for phase in PHASES}, "peak MB": peak})
         if not self.pipe.recv():
             sys.exit()
@@ -67,69 +81,91 @@ class Clock:
         self.phase, self.since = "rollout", time.perf_counter()
 
 
-def run_script(clock, env_id, envpool=False, n_envs=N_ENVS, evaluations=True):
-    """ppo_colored_continuous.py itself, with timers around the functions that its phases consist of or begin with."""
+def run_script(clock, env_id, flags="", n_envs=N_ENVS, evaluations=True):
+    """ppo_colored_continuous.py itself, with timers around the functions that its loop calls."""
     import ppo_colored_continuous as ppo
 
-    def compute_gae(*args):  # as in Stable-Baselines3, values and log-probabilities belong to the rollout
-        clock.switch("update")
-        return original_compute_gae(*args)
-
-    def save_checkpoint(*args):  # the last thing before the next rollout
-        timed_save_checkpoint(*args)
+    def keep(*args, **kwargs):  # the last thing before the next rollout
+        timed_keep(*args, **kwargs)
         clock.next_round()
 
     ppo.silence()
-    original_compute_gae, ppo.compute_gae = ppo.compute_gae, compute_gae
     ppo.evaluate = clock.timed("evaluation", ppo.evaluate)
     ppo.ColoredNoiseProcess.sample = clock.timed("noise", ppo.ColoredNoiseProcess.sample)
-    ppo.RunFolder.log = clock.timed("files", ppo.RunFolder.log)
-    ppo.RunFolder.add_evaluation = clock.timed("files", ppo.RunFolder.add_evaluation)
-    timed_save_checkpoint = clock.timed("files", ppo.RunFolder.save_checkpoint)
-    ppo.RunFolder.save_checkpoint = save_checkpoint
+    for name in ("log", "log_rollout", "add_evaluation"):
+        setattr(ppo.RunFolder, name, clock.timed("files", getattr(ppo.RunFolder, name)))
+    timed_keep = clock.timed("files", ppo.RunFolder.keep)
+    ppo.RunFolder.keep = keep
     with tempfile.TemporaryDirectory() as folder:
-        flags = f"--env-id {env_id} --n-envs {n_envs} --n-steps {N_STEPS} --runs-dir {folder} --total-timesteps 1e12 "
-        flags += f"--eval-freq {STEPS if evaluations else 1e12} --eval-episodes {EVAL_EPISODES if evaluations else 1}"
-        sys.argv = ["ppo_colored_continuous.py", *flags.split(), *["--envpool"] * envpool]
-        ppo.main()
+        settings = f"--env-id {env_id} --n-envs {n_envs} --n-steps {N_STEPS} --runs-dir {folder} "
+        settings += f"--eval-freq {STEPS if evaluations else 2_048_000} "
+        settings += f"--eval-episodes {EVAL_EPISODES if evaluations else 1} {flags}"
+        ppo.main(ppo.parse_args(settings.split()), learn=clock.timed("update", ppo.learn))
 
 
-def run_paper_stack(clock, env_id):
-    """Stable-Baselines3's PPO with noise from pink-noise-rl, and its EvalCallback over 10 environments."""
+def run_peer(clock, env_id, jax=False):
+    """PPO of Stable-Baselines3 or SBX, noise of pink-noise-rl, evaluated in 10 environments."""
     import gymnasium as gym
     import numpy as np
     import shimmy  # noqa: F401  registers the dm_control ids
     import torch
     from pink import ColoredNoiseProcess
-    from stable_baselines3 import PPO
     from stable_baselines3.common import callbacks
-    from stable_baselines3.common.distributions import DiagGaussianDistribution
     from stable_baselines3.common.env_util import make_vec_env
 
-    class ColoredGaussian(DiagGaussianDistribution):
-        def __init__(self, action_dim):
-            super().__init__(action_dim)
-            self.noise = ColoredNoiseProcess(0.5, (N_ENVS, action_dim, 1000), rng=np.random.default_rng(1))
-
-        def sample(self):
-            eps = torch.as_tensor(self.noise.sample(), dtype=torch.float32)
-            return self.distribution.mean + self.distribution.stddev * eps
+    if jax:
+        from sbx import PPO
+    else:
+        from stable_baselines3 import PPO
 
     torch.set_num_threads(1)
-    make = functools.partial(make_vec_env, env_id, seed=1, wrapper_class=gym.wrappers.FlattenObservation)
-    settings = dict(n_steps=N_STEPS, batch_size=BATCH_SIZE, n_epochs=N_EPOCHS, learning_rate=LEARNING_RATE)
-    model = PPO("MlpPolicy", make(n_envs=N_ENVS), **settings, seed=1)
-    model.policy.action_dist = ColoredGaussian(model.action_space.shape[0])
+    flatten = gym.wrappers.FlattenObservation
+    make = functools.partial(make_vec_env, env_id, seed=1, wrapper_class=flatten)
+    settings = dict(n_steps=N_STEPS, batch_size=BATCH_SIZE, n_epochs=N_EPOCHS, seed=1)
+    model = PPO("MlpPolicy", make(n_envs=N_ENVS), learning_rate=LEARNING_RATE, **settings)
+    shape = (N_ENVS, model.action_space.shape[0], 1000)
+    noise = ColoredNoiseProcess(0.5, shape, rng=np.random.default_rng(1))
+    (color_jax if jax else color_torch)(model.policy, noise)
     model.train = clock.timed("update", model.train)
     callbacks.evaluate_policy = clock.timed("evaluation", callbacks.evaluate_policy)
-    evaluation = callbacks.EvalCallback(make(n_envs=10), None, None, EVAL_EPISODES, eval_freq=N_STEPS, verbose=0)
+    how = dict(n_eval_episodes=EVAL_EPISODES, eval_freq=N_STEPS, verbose=0)
+    evaluation = callbacks.EvalCallback(make(n_envs=10), **how)
     while True:
         clock.next_round()
         model.learn(STEPS, evaluation, reset_num_timesteps=False)
 
 
+def color_torch(policy, noise):
+    """Makes Stable-Baselines3's policy draw from the noise, as the paper's code does."""
+    import torch
+    from stable_baselines3.common.distributions import DiagGaussianDistribution
+
+    class ColoredGaussian(DiagGaussianDistribution):
+        def sample(self):
+            eps = torch.as_tensor(noise.sample(), dtype=torch.float32)
+            return self.distribution.mean + self.distribution.stddev * eps
+
+    policy.action_dist = ColoredGaussian(policy.action_space.shape[0])
+
+
+def color_jax(policy, noise):
+    """The same for SBX, in its one compiled function that acts."""
+    import jax
+
+    @jax.jit
+    def predict_all(actor_state, vf_state, obs, eps):
+        dist = actor_state.apply_fn(actor_state.params, obs)
+        actions = dist.mean() + dist.stddev() * eps
+        values = vf_state.apply_fn(vf_state.params, obs).flatten()
+        return actions, dist.log_prob(actions), values
+
+    policy.predict_all = lambda obs, key: predict_all(
+        policy.actor_state, policy.vf_state, obs, noise.sample().astype("float32")
+    )
+
+
 def run_eager(clock, env_id):
-    """PPO as CleanRL writes it: tensors step by step, autograd and Adam. Evaluated as this script does it."""
+    """PPO as CleanRL writes it: tensors step by step, autograd and Adam. Evaluated as here."""
     import numpy as np
     import torch
     from torch.distributions import Normal
@@ -149,7 +185,12 @@ def run_eager(clock, env_id):
         mean = agent.actor_mean(x)
         probs = Normal(mean, agent.log_std.expand_as(mean).exp())
         action = probs.sample() if action is None else action
-        return action, probs.log_prob(action).sum(1), probs.entropy().sum(1), agent.critic(x).view(-1)
+        return (
+            action,
+            probs.log_prob(action).sum(1),
+            probs.entropy().sum(1),
+            agent.critic(x).view(-1),
+        )
 
     @torch.no_grad()
     def policy(x):
@@ -160,10 +201,17 @@ def run_eager(clock, env_id):
         for t in range(N_STEPS):
             obs[t], dones[t] = next_obs, next_done
             actions[t], logprobs[t], _, values[t] = get_action_and_value(next_obs)
-            next_obs, reward, terminated, truncated, _ = envs.step(np.clip(actions[t].numpy(), low, high))
+            next_obs, reward, terminated, truncated, _ = envs.step(
+                np.clip(actions[t].numpy(), low, high)
+            )
             next_obs, rewards[t] = torch.tensor(next_obs), torch.tensor(reward)
             next_done = torch.tensor(terminated | truncated, dtype=torch.float32)
-        advantages, last, value, done = torch.zeros_like(rewards), 0, agent.critic(next_obs).view(-1), next_done
+        advantages, last, value, done = (
+            torch.zeros_like(rewards),
+            0,
+            agent.critic(next_obs).view(-1),
+            next_done,
+        )
         for t in reversed(range(N_STEPS)):
             delta = rewards[t] + GAMMA * value * (1 - done) - values[t]
             advantages[t] = last = delta + GAMMA * GAE_LAMBDA * (1 - done) * last
@@ -181,9 +229,13 @@ def run_eager(clock, env_id):
                 _, new_logprobs, _, new_values = get_action_and_value(mb_obs, mb_actions)
                 ratio = (new_logprobs - mb_logprobs).exp()
                 clip_fractions.append(((ratio - 1).abs() > CLIP_RANGE).float().mean().item())
-                mb_advantages = (mb_advantages - mb_advantages.mean()) / (mb_advantages.std() + 1e-8)
+                mb_advantages = (mb_advantages - mb_advantages.mean()) / (
+                    mb_advantages.std() + 1e-8
+                )
                 clipped_ratio = torch.clamp(ratio, 1 - CLIP_RANGE, 1 + CLIP_RANGE)
-                policy_loss = torch.max(-mb_advantages * ratio, -mb_advantages * clipped_ratio).mean()
+                policy_loss = torch.max(
+                    -mb_advantages * ratio, -mb_advantages * clipped_ratio
+                ).mean()
                 optimizer.zero_grad()
                 (policy_loss + 0.5 * ((new_values - mb_returns) ** 2).mean()).backward()
                 torch.nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
@@ -198,7 +250,7 @@ def run_eager(clock, env_id):
 
 
 def run_physics(clock, env_id):
-    """mj_step on a dm_control task's model, with its number of substeps per control step; resets are not counted."""
+    """mj_step on a dm_control task's model, with its substeps; resets are not counted."""
     import mujoco
     import numpy as np
     from dm_control import suite
@@ -207,7 +259,10 @@ def run_physics(clock, env_id):
         raise ValueError("it knows only dm_control's models")
     env = suite.load(*env_id.removeprefix("dm_control/").removesuffix("-v0").split("-"))
     model, data = env.physics.model.ptr, env.physics.data.ptr
-    n_substeps, episode_length = round(env.control_timestep() / model.opt.timestep), round(env._step_limit)
+    n_substeps, episode_length = (
+        round(env.control_timestep() / model.opt.timestep),
+        round(env._step_limit),
+    )
     random = np.random.default_rng(1).normal(size=(episode_length, model.nu)).clip(-1, 1)
 
     def simulate(n_steps, actions):
@@ -233,7 +288,7 @@ def contend(pipe, run, env_id):
 
 
 def measure(env_id, contenders, n_rounds, n_envs=N_ENVS):
-    """Lets contenders, {name: run}, play one round that is not counted (but if n_rounds is 0) and n_rounds, in turns.
+    """Lets contenders, {name: run}, play a round that is not counted and n_rounds, in turns.
 
     Returns a list of table rows, of those that can run.
     """
@@ -246,7 +301,13 @@ def measure(env_id, contenders, n_rounds, n_envs=N_ENVS):
             del pipes[name]
         return result
 
-    context, pipes, processes, startup, rounds = multiprocessing.get_context("spawn"), {}, {}, {}, defaultdict(list)
+    context, pipes, processes, startup, rounds = (
+        multiprocessing.get_context("spawn"),
+        {},
+        {},
+        {},
+        defaultdict(list),
+    )
     for name, run in contenders.items():
         pipes[name], pipe = context.Pipe()
         processes[name] = context.Process(target=contend, args=(pipe, run, env_id), daemon=True)
@@ -262,20 +323,33 @@ def measure(env_id, contenders, n_rounds, n_envs=N_ENVS):
     for name, pipe in pipes.items():
         pipe.send(False)
         processes[name].join()
-        table = pd.DataFrame(rounds[name][1:] or rounds[name])
+        table = pd.DataFrame(rounds[name][1:])
         table[PHASES] *= 1e6 / (n_envs * N_STEPS)
         table["evaluation"] *= STEPS / EVAL_FREQ
         total = table[PHASES].sum(axis=1)
-        summary = {"total us": total.median(), "from": total.min(), "to": total.max(), "start-up s": startup[name]}
-        rows.append({"env_id": env_id, "contender": name, "n_envs": n_envs, **table.median(), **summary})
+        summary = {
+            "total us": total.median(),
+            "from": total.min(),
+            "to": total.max(),
+            "start-up s": startup[name],
+        }
+        rows.append(
+            {"env_id": env_id, "contender": name, "n_envs": n_envs, **table.median(), **summary}
+        )
     return rows
 
 
 def compare(env_id, n_rounds):
-    """All contenders on one environment. Returns the rows of the table, with the ratios of the totals."""
-    ours = {"this script, --envpool": functools.partial(run_script, envpool=True), "this script": run_script}
-    others = {PAPER: run_paper_stack, "eager PPO": run_eager, PHYSICS: run_physics}
-    rows = measure(env_id, {**ours, **others}, n_rounds)
+    """All contenders on one environment. Returns the table's rows, with ratios of the totals."""
+    ours = {"this script": functools.partial(run_script, flags="--threads 1")}
+    flags = "--threads 1 --no-envpool"
+    ours["this script, --no-envpool"] = functools.partial(run_script, flags=flags)
+    others = {PAPER: run_peer, "SBX": functools.partial(run_peer, jax=True)}
+    others |= {"eager PPO": run_eager, PHYSICS: run_physics}
+    if importlib.util.find_spec("sbx") is None:
+        print("note: without SBX (pip install sbx-rl)", file=sys.stderr)
+        del others["SBX"]
+    rows = measure(env_id, ours | others, n_rounds)
     totals = {row["contender"]: row["total us"] for row in rows}
     for row in rows:
         row["x faster"] = totals.get(PAPER, float("nan")) / row["total us"]
@@ -284,37 +358,65 @@ def compare(env_id, n_rounds):
 
 
 def compare_n_envs(env_id, all_n_envs):
-    """This script's training, without evaluations, with each number of environments. Returns rows of the table."""
+    """This script's training, without evaluations, with each number of environments."""
     rows = []
     for n_envs in all_n_envs:
-        for name, envpool in [("this script, --envpool", True), ("this script", False)]:
-            run = functools.partial(run_script, envpool=envpool, n_envs=n_envs, evaluations=False)
-            n_rounds = 1 if n_envs < 64 else 0  # a long round needs no other before it
-            rows += measure(env_id, {f"{name}, training": run}, n_rounds, n_envs)
+        for flags in ("--threads 1", "--threads 1 --no-envpool"):
+            how = dict(flags=flags, n_envs=n_envs, evaluations=False)
+            contender = f"training, {flags}".replace("training, --threads 1 ", "training, ")
+            run = functools.partial(run_script, **how)
+            rows += measure(env_id, {contender: run}, 1, n_envs)
     return rows
+
+
+def compare_threads(env_ids, n_cores, n_rounds):
+    """One run on one core and on all: the whole protocol's minutes, by its rounds."""
+    rows = []
+    for env_id in env_ids:
+        for n in sorted({1, n_cores}):
+            hold_on_cores(n)
+            run = functools.partial(run_script, flags=f"--threads {n}")
+            rows += measure(env_id, {f"one run, {n} core{'s'[: n > 1]}": run}, n_rounds)
+            rows[-1]["minutes"] = rows[-1]["total us"] * 2.048 / 60
+    return rows
+
+
+def hold_on_cores(n):
+    """Holds this process, and those it starts from now on, on the last n of its cores."""
+    if hasattr(os, "sched_setaffinity"):  # Linux
+        os.sched_setaffinity(0, CORES[-n:])
 
 
 def main():
     import pandas as pd
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    tasks = ["pendulum-swingup", "cheetah-run", "walker-run"]
-    parser.add_argument("--env-ids", nargs="+", default=[f"dm_control/{task}-v0" for task in tasks])
-    parser.add_argument("--rounds", type=int, default=3, help="rounds that count, after one that does not")
-    parser.add_argument("--n-envs", type=int, nargs="*", default=[1, 4, 16, 64, 128], help="compared on the first id")
+    dm_control = [f"dm_control/{t}-v0" for t in ("pendulum-swingup", "cheetah-run", "walker-run")]
+    parser.add_argument("--env-ids", nargs="+", default=dm_control)
+    parser.add_argument("--rounds", type=int, default=3, help="that count, after one that does not")
+    parser.add_argument("--n-envs", type=int, nargs="*", default=[1, 4, 16, 64, 128],
+                        help="compared on the first id")  # fmt: skip
+    threads = ["dm_control/walker-run-v0", "AntUMaze-v1", "door-v0"]
+    parser.add_argument("--thread-env-ids", nargs="*", default=threads, help="of the third table")
     parser.add_argument("--csv", default="benchmark.csv", help="file for the table")
     args = parser.parse_args()
 
-    if hasattr(os, "sched_setaffinity"):  # Linux
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    hold_on_cores(1)
     tables = [functools.partial(compare, env_id, args.rounds) for env_id in args.env_ids]
-    tables += [functools.partial(compare_n_envs, args.env_ids[0], args.n_envs)] if args.n_envs else []
+    if args.n_envs:
+        tables.append(functools.partial(compare_n_envs, args.env_ids[0], args.n_envs))
+    if args.thread_env_ids:
+        how = (args.thread_env_ids, len(CORES), args.rounds)
+        tables.append(functools.partial(compare_threads, *how))
     rows = []
     for make_rows in tables:
         rows += (table := make_rows())
         pd.DataFrame(rows).round(3).to_csv(args.csv, index=False)
         table = pd.DataFrame(table).set_index(["env_id", "contender", "n_envs"])
-        digits = {column: "{:.2f}".format if column.startswith("x ") else "{:.1f}".format for column in table}
+        digits = {
+            column: "{:.2f}".format if column.startswith("x ") else "{:.1f}".format
+            for column in table
+        }
         print(table.to_string(formatters=digits), end="\n\n", flush=True)
 
 

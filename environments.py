@@ -1,60 +1,131 @@
-"""Vector environments by id: Gymnasium's own, and dm_control's through shimmy, with flat float32 observations.
+"""Vector environments by id: Gymnasium's own, and dm_control's through shimmy, with flat float32
+observations.
 
-Importing this file is quick and silent: the package behind an environment is imported when one is made.
+Importing this file is quick and silent: the package behind an environment is imported when one is
+made.
 """
 
 import contextlib
 import difflib
 import functools
+import importlib.util
 import io
 import logging
 import math
 import os
 import re
+import sys
+import tempfile
 import warnings
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
 
 
 def silence():
-    """Keeps the warnings and log lines of the packages used here off the terminal. For a program, not for a library."""
+    """Keeps the warnings and log lines of the packages used here off the terminal.
+
+    For a program, not for a library.
+    """
+    global silent
+    silent = True
     gym.logger.min_level = gym.logger.ERROR + 1
     logging.getLogger("absl").setLevel(logging.ERROR)
-    warnings.showwarning = lambda *args, **kwargs: None  # filters would not do: some packages set their own
+    warnings.showwarning = lambda *args, **kwargs: None  # filters: some packages set their own
+
+
+silent = False
+
+
+def silence_mujoco():
+    """Keeps MuJoCo's warnings off the terminal and out of the file MUJOCO_LOG.TXT.
+
+    Not part of `silence`: MuJoCo chooses its renderer when it is imported, see make_render_env.
+    """
+    with contextlib.suppress(ImportError):
+        import mujoco
+
+        mujoco.set_mju_user_warning(lambda message: None)
 
 
 # --- The mazes and the Adroit door
-MAZE_IDS = ["PointUMaze-v1", "Point4Rooms-v1", "AntUMaze-v1", "Ant4Rooms-v1", "SwimmerUMaze-v1", "Swimmer4Rooms-v1"]
+MAZE_IDS = [
+    "PointUMaze-v1",
+    "Point4Rooms-v1",
+    "AntUMaze-v1",
+    "Ant4Rooms-v1",
+    "SwimmerUMaze-v1",
+    "Swimmer4Rooms-v1",
+]
 MAZE_IDS += ["PointPush-v1", "AntPush-v1", "PointPushMaze-v1", "AntPushMaze-v1"]
 for env_id in MAZE_IDS:  # Gymnasium's checks of every step would cost more than the point's physics
     robot, maze = re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id).groups()
     kwargs = {"robot": robot.lower(), "maze": maze}
-    gym.register(env_id, "mazes:MazeEnv", max_episode_steps=1000, disable_env_checker=True, kwargs=kwargs)
+    options = {"max_episode_steps": 1000, "reward_threshold": 0.9, "disable_env_checker": True}
+    gym.register(env_id, "mazes:MazeEnv", kwargs=kwargs, **options)
 gym.register("door-v0", "environments:make_door", max_episode_steps=200, disable_env_checker=True)
 
 
 def make_door(**kwargs):
-    """Makes D4RL's `door-v0` from gymnasium-robotics; takes the arguments of its AdroitHandDoorEnv but reward_type.
+    """Makes D4RL's `door-v0` from gymnasium-robotics.
 
-    The package's AdroitHandDoor-v1 rewards the distance between palm and handle with +0.1 per m, D4RL with -0.1.
+    Takes the arguments of the package's AdroitHandDoorEnv but reward_type.
+    """
+    return door_class()(**kwargs)
+
+
+@functools.cache
+def door_class():
+    """The class of `door-v0`, inside a function since importing its base takes a second.
+
+    The package's AdroitHandDoor-v1 rewards the distance between palm and handle with +0.1 per m,
+    D4RL with -0.1.
     """
     with contextlib.redirect_stderr(io.StringIO()):  # importing the package prints a notice
         from gymnasium_robotics.envs.adroit_hand.adroit_door import AdroitHandDoorEnv
+    import mujoco
 
     class AdroitDoor(AdroitHandDoorEnv):
+        def __init__(self, render_mode=None, **kwargs):
+            self._visible = render_mode is not None
+            self._kwargs = {"render_mode": render_mode, **kwargs}
+            super().__init__(reward_type="dense", **self._kwargs)
+
+        def _initialize_simulation(self):
+            if self._visible:
+                return super()._initialize_simulation()
+            # Meshes and textures that are only seen take 6.7 of the model's 6.8 MB
+            spec = mujoco.MjSpec.from_file(self.fullpath)
+            spec.compiler.discardvisual = True
+            model = spec.compile()
+            return model, mujoco.MjData(model)
+
         def step(self, action):
             obs, reward, terminated, truncated, info = super().step(action)
             palm_to_handle = math.hypot(*obs[-4:-1])
             return obs, reward - 0.2 * palm_to_handle, terminated, truncated, info
 
-    return AdroitDoor(reward_type="dense", **kwargs)
+        # The package copies and pickles constructor arguments only; the episode would start anew
+        def __reduce__(self):
+            return functools.partial(make_door, **self._kwargs), (), self.__getstate__()
+
+        def __getstate__(self):
+            return {k: v for k, v in self.__dict__.items() if k != "mujoco_renderer"}
+
+        def __setstate__(self, state):
+            self.__dict__.update(state)
+            self.mujoco_renderer.model, self.mujoco_renderer.data = self.model, self.data
+
+    return AdroitDoor
 
 
 class FlatObservations(gym.Wrapper):
-    """Flattens observations of any space into one float32 vector (a Dict in its order of keys), and drops the infos."""
+    """Flattens observations into one float32 vector (a Dict in its order of keys); drops infos."""
 
     def __init__(self, env):
         super().__init__(env)
@@ -73,38 +144,208 @@ class FlatObservations(gym.Wrapper):
         return spaces.flatten(self.env.observation_space, obs).astype(np.float32)
 
 
-def make_env(env_id, **kwargs):
+def make_env(env_id, max_episode_steps=None, **kwargs):
     """Makes one environment with observations (obs_dim,) float32 and a Box action space.
 
-    Raises gymnasium.error.Error with a message for the user: unknown id (naming close matches), a package that is
-    missing, or actions that are not continuous.
-    """
-    if env_id.startswith("dm_control/"):
-        import shimmy  # noqa: F401  registers the dm_control ids
-    try:
-        env = gym.make(env_id, disable_env_checker=True, **kwargs)
-    except gym.error.UnregisteredEnv:
-        import shimmy  # noqa: F401, F811
+    env_id is a registered id or "module:Id", whose module, in the current folder or installed,
+    registers the Id. max_episode_steps takes the place of the task's own time limit (but not of
+    those inside dm_control's locomotion and manipulation).
 
-        matches = difflib.get_close_matches(env_id, gym.registry, n=3, cutoff=0.4)
-        raise gym.error.UnregisteredEnv(f"unknown environment {env_id}; did you mean {' or '.join(matches)}?") from None
+    Raises gymnasium.error.Error with a message for the user: unknown id (naming close matches), a
+    package that is missing, actions that are not continuous, observations without a fixed size.
+    What a user's module or environment raises comes through with its traceback, a gymnasium.error
+    as the cause of a RuntimeError.
+    """
+    module, _, name = env_id.rpartition(":")
+    if silent:
+        silence_mujoco()
+    if module:
+        import_module_of(env_id, module)
+    try:
+        if name.startswith("dm_control/"):
+            import shimmy  # noqa: F401  registers the dm_control ids
+        if max_episode_steps is not None and is_from_dm_control_suite(name):
+            kwargs["task_kwargs"] = {"time_limit": math.inf}  # s, its limit inside Gymnasium's
+        with contextlib.nullcontext() if "render_mode" in kwargs else tiny_textures():
+            env = gym.make(name, max_episode_steps, disable_env_checker=True, **kwargs)
+    except gym.error.Error as error:
+        if module and name in gym.registry:  # then it is the environment's own error
+            raise RuntimeError(f"{env_id} cannot be made") from error
+        if isinstance(error, gym.error.UnregisteredEnv):
+            raise gym.error.UnregisteredEnv(unknown_id_message(env_id, name)) from None
+        raise
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled(f"{env_id} needs a package that is not installed: {error}") from error
-    if not isinstance(env.action_space, spaces.Box):
-        raise gym.error.Error(f"{env_id} has actions {env.action_space}; colored noise needs continuous ones (Box)")
+        if module:
+            raise
+        raise gym.error.DependencyNotInstalled(
+            f"{env_id} needs a package that is not installed: {error}"
+        ) from error
+    actions, observations = env.action_space, env.observation_space
+    if not isinstance(actions, spaces.Box) or not np.issubdtype(actions.dtype, np.floating):
+        raise gym.error.Error(
+            f"{env_id} has actions {actions}; colored noise needs continuous ones (Box, floating)"
+        )
+    if not observations.is_np_flattenable:
+        raise gym.error.Error(
+            f"{env_id} has observations {observations}; the networks need a fixed number of values"
+        )
     return FlatObservations(env)
 
 
-def make_vector_env(env_id, n_envs, envpool=False):
-    """Makes n_envs environments that step together: observations (n_envs, obs_dim) float32, SAME_STEP autoreset.
+def import_module_of(env_id, module):
+    """Imports the module that registers an environment, from the current folder or installed."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # behind all else: a file there must not hide a package
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # what the module itself imports
+        raise gym.error.DependencyNotInstalled(
+            f"{env_id}: there is no {module}.py in the current folder and no package {module}"
+        ) from None
 
-    The step that ends an episode returns the next episode's first observation, and the ended one's last observation in
-    infos["final_obs"]. Gymnasium's default, NEXT_STEP, inserts a dummy transition between episodes instead.
-    Observations are overwritten by the next step. Raises as make_env does. With envpool they are EnvPool's.
+
+def unknown_id_message(env_id, name):
+    with contextlib.suppress(ImportError):
+        import shimmy  # noqa: F401  dm_control's ids may be meant
+    matches = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.4)
+    message = f"unknown environment {env_id}"
+    if matches:
+        message += f"; did you mean {' or '.join(matches)}?"
+    if name == env_id:
+        message += f" (one that your my_env.py or a package registers: my_env:{name})"
+    return message
+
+
+def is_from_dm_control_suite(name):
+    entry_point = getattr(gym.registry.get(name), "entry_point", None)
+    return "domain_name" in getattr(entry_point, "keywords", {})
+
+
+def one_pixel_wide(xml):
+    return re.sub(rb'(width|height)="\d+"', rb'\1="1"', xml)
+
+
+@contextlib.contextmanager
+def tiny_textures():
+    """Makes the sky and the floor of dm_control's suite one pixel wide, in models made meanwhile.
+
+    They take 12 MB of memory in each environment, and matter to pictures alone.
     """
+    common = sys.modules.get("dm_control.suite.common")
+    assets = dict(common.ASSETS) if common else {}
+    for file in assets.keys() & {"./common/skybox.xml", "./common/materials.xml"}:
+        common.ASSETS[file] = one_pixel_wide(assets[file])
+    try:
+        yield
+    finally:
+        if common:
+            common.ASSETS.update(assets)
+
+
+def make_vector_env(env_id, n_envs, envpool=False, threads=1, max_episode_steps=None):
+    """Makes n_envs environments that step together, with SAME_STEP autoreset.
+
+    Observations are (n_envs, obs_dim) float32 and overwritten by the next step. The step that ends
+    an episode returns the next episode's first observation, and the ended one's last observation
+    in infos["final_obs"]. Gymnasium's default, NEXT_STEP, inserts a dummy transition between
+    episodes instead.
+
+    With envpool they are EnvPool's. Up to `threads` threads step them where that helps, with the
+    same results. max_episode_steps takes the place of the task's own time limit, if it is given.
+    Raises as make_env does.
+    """
+    if envpool and max_episode_steps is not None:
+        raise gym.error.Error(
+            f"EnvPool's {env_id} has its own time limit: --max-episode-steps needs --no-envpool"
+        )
     if envpool:
-        return EnvPoolVectorEnv(env_id, n_envs)
-    return SyncVectorEnv([lambda: make_env(env_id)] * n_envs, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+        return EnvPoolVectorEnv(env_id, n_envs, threads)
+    envs = [make_env(env_id, max_episode_steps=max_episode_steps) for _ in range(n_envs)]
+    if min(threads, n_envs) > 1 and gains_by_threads(envs[0].unwrapped):
+        return ThreadedVectorEnv(envs, threads)
+    return sync_vector_env(envs)
+
+
+def gains_by_threads(env):
+    """Whether most of a step is MuJoCo's: only there may Python's other threads run meanwhile.
+
+    An environment in Python has no gain, and dm_control, whose Python takes longer than its
+    physics and whose model is not env.model, a loss.
+    """
+    mujoco = sys.modules.get("mujoco")
+    return mujoco is not None and isinstance(getattr(env, "model", None), mujoco.MjModel)
+
+
+def sync_vector_env(envs):
+    functions = [lambda env=env: env for env in envs]
+    return SyncVectorEnv(functions, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+class ThreadedVectorEnv(VectorEnv):
+    """Environments split among threads, each of which steps its part as a SyncVectorEnv.
+
+    Results equal those of one SyncVectorEnv bit for bit, if the environments share no state. What
+    an environment raises comes through with its traceback.
+    """
+
+    def __init__(self, envs, n_threads):
+        self.envs, self.num_envs = envs, len(envs)
+        n_parts = min(n_threads, len(envs))
+        self._ends = [len(envs) * i // n_parts for i in range(n_parts + 1)]
+        self._parts = [sync_vector_env(envs[i:j]) for i, j in self._slices()]
+        self._pool = ThreadPoolExecutor(n_parts - 1)  # the caller's own thread steps the first part
+        self.metadata, self.render_mode = self._parts[0].metadata, envs[0].render_mode
+        self.single_observation_space = envs[0].observation_space
+        self.single_action_space = envs[0].action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def _slices(self):
+        return zip(self._ends[:-1], self._ends[1:], strict=True)
+
+    def _each(self, calls):
+        futures = [self._pool.submit(call) for call in calls[1:]]
+        try:
+            first = calls[0]()
+        finally:
+            wait(futures)  # what comes next, be it an error, finds no environment in mid-step
+        return zip(first, *(future.result() for future in futures), strict=True)
+
+    def reset(self, *, seed=None, options=None):
+        if seed is None or isinstance(seed, int):
+            seed = [None if seed is None else seed + i for i in range(self.num_envs)]
+        seeds = [seed[i:j] for i, j in self._slices()]
+        calls = [
+            functools.partial(part.reset, seed=part_seeds, options=options)
+            for part, part_seeds in zip(self._parts, seeds, strict=True)
+        ]
+        obs, _ = self._each(calls)  # FlatObservations drops the infos
+        return np.concatenate(obs), {}
+
+    def step(self, actions):
+        calls = [
+            functools.partial(part.step, actions[i:j])
+            for part, (i, j) in zip(self._parts, self._slices(), strict=True)
+        ]
+        *arrays, parts_infos = self._each(calls)
+        infos = {}
+        for (i, j), part_infos in zip(self._slices(), parts_infos, strict=True):
+            if "final_obs" in part_infos:
+                infos.setdefault("final_obs", np.full(self.num_envs, None))
+                infos["final_obs"][i:j] = part_infos["final_obs"]
+        return *map(np.concatenate, arrays), infos
+
+    def close_extras(self, **kwargs):
+        self._pool.shutdown()
+        for part in self._parts:
+            part.close()
+
+
+def envpool_has(env_id):
+    """Whether EnvPool has this task and is installed, without importing it."""
+    return env_id in ENVPOOL_TASKS and importlib.util.find_spec("envpool") is not None
 
 
 ENVPOOL_TASKS = {
@@ -119,6 +360,8 @@ ENVPOOL_TASKS = {
     "dm_control/walker-run-v0": "WalkerRun-v1",
     "door-v0": "AdroitHandDoor-v1",
 }
+# Those that two threads step faster, at 50 environments; the others' physics is too quick for it
+GAIN_BY_THREADS = {"dm_control/cheetah-run-v0", "dm_control/walker-run-v0"}
 
 COMPLEX = MAZE_IDS[-4:]  # Sec. A8: not in the paper's averages
 # fmt: off
@@ -139,56 +382,77 @@ NAMES = {  # environment id: its name in the paper (Sec. A4)
 
 
 class EnvPoolVectorEnv(VectorEnv):
-    """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds (see reset).
+    """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds.
 
-    Raises gymnasium.error.Error, with a message for the user, for other tasks and where EnvPool is not installed.
+    Raises gymnasium.error.Error, with a message for the user, for other tasks and where EnvPool is
+    not installed.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, env_id, n_envs):
+    def __init__(self, env_id, n_envs, threads=1):
         if env_id not in ENVPOOL_TASKS:
-            raise gym.error.Error(f"--envpool does not have {env_id}, only {', '.join(ENVPOOL_TASKS)}")
+            raise gym.error.Error(
+                f"--envpool does not have {env_id}, only {', '.join(ENVPOOL_TASKS)}"
+            )
         try:
             import envpool
         except ImportError as error:
-            raise gym.error.DependencyNotInstalled(f"--envpool needs EnvPool (pip install envpool): {error}") from error
-        self._make = functools.partial(envpool.make_gymnasium, ENVPOOL_TASKS[env_id], num_envs=n_envs, num_threads=1)
+            raise gym.error.DependencyNotInstalled(
+                f"--envpool needs EnvPool (pip install envpool): {error}"
+            ) from error
+        self._options = {"num_envs": n_envs, "num_threads": 1}
+        if env_id in GAIN_BY_THREADS:
+            self._options["num_threads"] = min(threads, n_envs)
         spec = envpool.make_spec(ENVPOOL_TASKS[env_id])
         self.env_id, self.num_envs, self._pool = env_id, n_envs, None
         obs_dim = spaces.flatdim(spec.gymnasium_observation_space)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
         action_space = spec.gymnasium_action_space
         self.single_action_space = spaces.Box(action_space.low, action_space.high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, n_envs)
+        self.action_space = batch_space(self.single_action_space, n_envs)
         self._indices, self._action_dtype = np.arange(n_envs, dtype=np.int32), action_space.dtype
-        self._state_keys = spec._state_keys  # "obs", or "obs:position" and so on; "reward", "done", "trunc"
+        self._state_keys = (
+            spec._state_keys
+        )  # "obs", or "obs:position" and so on; "reward", "done", "trunc"
         self._obs_keys = sorted(key for key in self._state_keys if key.split(":")[0] == "obs")
 
     def reset(self, *, seed=None, options=None):
-        """Starts new episodes. Only the first reset heeds the seeds, a list of n_envs integers below 2^32.
+        """Starts new episodes. Only the first reset heeds the seeds, n_envs integers below 2^32.
 
-        EnvPool takes its seeds when it is made, which takes seconds; the environments' generators run on afterwards.
+        An integer stands for seed, seed + 1 and so on, None for 0, 1 and so on. EnvPool takes its
+        seeds when it is made, which takes seconds; the environments' generators run on afterwards.
         """
         if self._pool is None:
-            seed = range(self.num_envs) if seed is None else seed
-            self._pool = self._make(seed=np.array(seed, np.uint32).view(np.int32))  # EnvPool's seeds are int32
+            if seed is None or isinstance(seed, int):
+                seed = [(seed or 0) + i for i in range(self.num_envs)]
+            self._pool = self._make_pool(np.array(seed, np.uint32).view(np.int32))  # of int32
             self._fresh = np.zeros(self.num_envs, bool)
             self._obs = np.empty((self.num_envs, *self.single_observation_space.shape), np.float32)
-        self._begin_episodes(np.flatnonzero(~self._fresh))  # the others have just been reset by step
+        self._begin_episodes(
+            np.flatnonzero(~self._fresh)
+        )  # the others have just been reset by step
         return self._obs.copy(), {}
 
     def step(self, actions):
-        # The two functions that EnvPool's step() calls; the rest of it takes as long as the physics of four pendulums
-        actions = np.reshape(actions, (self.num_envs, *self.single_action_space.shape))  # or C++ reads on past the end
-        self._pool._send([self._indices, self._indices, np.asarray(actions, self._action_dtype, order="C")])
+        # The two functions that EnvPool's step() calls; the rest of it takes as long as the
+        # physics of four pendulums
+        actions = np.reshape(
+            actions, (self.num_envs, *self.single_action_space.shape)
+        )  # or C++ reads on past the end
+        self._pool._send(
+            [self._indices, self._indices, np.asarray(actions, self._action_dtype, order="C")]
+        )
         state = self._receive()
         self._obs, rewards, truncated = state["obs"], state["reward"], state["trunc"]
         terminated = state["done"] & ~truncated
         if self.env_id == "door-v0":  # EnvPool has the sign of the reaching term flipped as well
             rewards = rewards - 0.2 * np.linalg.norm(self._obs[:, -4:-1], axis=1)
         elif self.env_id == "dm_control/ball_in_cup-catch-v0":
-            # EnvPool takes the radius of the cup's wall, 0.008, for the ball's, 0.025, and pays for balls half outside.
-            # The observation begins with the positions (x, z) of cup and ball, relative to (0, 0.6) and (0, 0.2).
+            # EnvPool takes the radius of the cup's wall, 0.008, for the ball's, 0.025, and pays for
+            # balls half outside. The observation begins with the positions (x, z) of cup and ball,
+            # relative to (0, 0.6) and (0, 0.2).
             ball_to_target = self._obs[:, :2] - self._obs[:, 2:4] + (0, 0.6 - 0.05 - 0.2)
             rewards = (np.abs(ball_to_target) < 0.05 - 0.025).all(axis=1).astype(np.float32)
         infos = {}
@@ -197,6 +461,30 @@ class EnvPoolVectorEnv(VectorEnv):
             infos["final_obs"] = self._obs.copy()
             self._begin_episodes(np.flatnonzero(self._fresh))
         return self._obs, rewards, terminated, truncated, infos
+
+    def _make_pool(self, seeds):
+        """Makes EnvPool's environments from models without what only pictures show.
+
+        Or each takes 13 MB of memory in dm_control's tasks instead of 1, and 8 in the door's.
+        """
+        import envpool
+
+        originals = Path(envpool.registration.base_path, "mujoco")
+        with tempfile.TemporaryDirectory() as folder:
+            for models in ("assets_dmc", "robotics/assets/adroit_hand"):
+                for file in filter(Path.is_file, (originals / models).rglob("*")):
+                    copy = Path(folder, "mujoco", file.relative_to(originals))
+                    copy.parent.mkdir(parents=True, exist_ok=True)
+                    if file.name in ("skybox.xml", "materials.xml"):
+                        copy.write_bytes(one_pixel_wide(file.read_bytes()))
+                    elif file.name == "adroit_assets.xml":
+                        lean = b'<compiler discardvisual="true" '
+                        copy.write_bytes(file.read_bytes().replace(b"<compiler ", lean))
+                    else:
+                        copy.symlink_to(file)
+            return envpool.make_gymnasium(
+                ENVPOOL_TASKS[self.env_id], seed=seeds, base_path=folder, **self._options
+            )
 
     def _begin_episodes(self, indices):
         if len(indices):
@@ -211,32 +499,55 @@ class EnvPoolVectorEnv(VectorEnv):
         return state
 
 
-def make_render_env(env_id):
-    """Makes one environment that renders frames without a display; raises gymnasium.error.Error where it cannot."""
+def make_render_env(env_id, max_episode_steps=None):
+    """Makes one environment that renders frames without a display.
+
+    Raises gymnasium.error.Error where it cannot, and otherwise as make_env does.
+    """
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains on machines without sound
-    env = make_env(env_id, render_mode="rgb_array")
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains without sound
     try:
-        env.reset()
-        env.render()
-    except Exception as error:  # each renderer fails in its own way
+        env = make_env(env_id, max_episode_steps, render_mode="rgb_array")
+    except TypeError as error:
+        if "unexpected keyword argument 'render_mode'" not in str(error):
+            raise
         raise gym.error.Error(
-            f"cannot render {env_id} ({error}): install libegl1 and libgl1 and set MUJOCO_GL=egl, or MUJOCO_GL=osmesa"
+            f"cannot render {env_id}: it has to take the argument render_mode='rgb_array'"
         ) from error
+    env.reset()
+    try:
+        frame = env.render()
+    except Exception as error:  # each renderer fails in its own way
+        if ":" in env_id:
+            raise RuntimeError(f"cannot render {env_id}") from error
+        raise gym.error.Error(
+            f"cannot render {env_id} ({error}): install libegl1 and libgl1 and set MUJOCO_GL=egl, "
+            "or MUJOCO_GL=osmesa"
+        ) from error
+    if not isinstance(frame, np.ndarray) or frame.ndim != 3:
+        raise gym.error.Error(
+            f"cannot render {env_id}: render() has to return a picture, an array (height, width, "
+            f"3), not {f'shape {frame.shape}' if isinstance(frame, np.ndarray) else type(frame)}"
+        )
     return env
 
 
+def frames_per_second(env):
+    """Of the simulated time, where the environment says how long a step is: `dt`, in s."""
+    dt = getattr(env.unwrapped, "dt", None)
+    return 1 / dt if dt else env.metadata.get("render_fps") or 30
+
+
 def record_video(env, policy, path, seed):
-    """Plays one episode of policy(obs (1, obs_dim)) -> actions (1, action_dim) and saves it as a video (.mp4)."""
+    """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim); saves it as .mp4."""
     import imageio
 
     path.parent.mkdir(exist_ok=True)
-    fps = 1 / env.unwrapped.dt if hasattr(env.unwrapped, "dt") else env.metadata.get("render_fps", 30)
     obs, _ = env.reset(seed=seed)
     done = False
-    with imageio.get_writer(path, fps=fps, macro_block_size=2) as video:
+    with imageio.get_writer(path, fps=frames_per_second(env), macro_block_size=2) as video:
         while not done:
             video.append_data(env.render())
             obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])

@@ -1,13 +1,14 @@
-"""The maze tasks of mujoco-maze (https://github.com/kngwyu/mujoco-maze), rebuilt on today's MuJoCo and Gymnasium.
+"""The maze tasks of mujoco-maze (https://github.com/kngwyu/mujoco-maze) on today's MuJoCo.
 
-An ant, a point or a swimmer has to find a goal in a maze of square cells, in some mazes by pushing blocks out of its
-way. The original package needs gym and mujoco-py; this file needs neither and follows its version 1 tasks (a sparse
-reward at the goal) as they were before it moved to gym 0.26. Every environment is one `MazeEnv`:
+An ant, a point or a swimmer has to find a goal in a maze of square cells, in some mazes by pushing
+blocks out of its way. The original package needs gym and mujoco-py; this file needs neither and
+follows its version 1 tasks (a sparse reward at the goal) as they were before it moved to gym 0.26.
+Every environment is one `MazeEnv`:
 
-    gymnasium.make("AntUMaze-v1")                       # after `import environments`, which registers the ids
-    mazes.MazeEnv(robot="ant", maze="UMaze")            # the same, without the limit of 1000 steps
+    gymnasium.make("AntUMaze-v1")             # after `import environments`, which registers the ids
+    mazes.MazeEnv(robot="ant", maze="UMaze")  # the same, without the limit of 1000 steps
 
-The robots are the XML models that Gymnasium ships; what differs from them is changed in `build_model`.
+The robots are the XML models that Gymnasium ships; `build_model` changes what differs from them.
 """
 
 import math
@@ -29,7 +30,9 @@ POINT_MAX_VELOCITY = 10.0
 
 
 class Maze(NamedTuple):
-    grid: str  # '#' wall, '.' free, 'R' robot, 'M' block movable in x and y; columns run along +x, rows along +y
+    # '#' wall, '.' free, 'R' robot, 'M' block movable in x and y. Columns run along +x, rows along
+    # +y.
+    grid: str
     goal: tuple[float, float]  # (x, y) in cells, seen from the robot's cell
     scale: dict[str, float]  # side of a cell in m, for each robot that the task has
 
@@ -94,21 +97,36 @@ class Robot(NamedTuple):
     substeps: int  # of the physics per environment step
 
 
-ROBOTS = {"ant": Robot(15, 14, 0.02, 5), "point": Robot(3, 3, 0.02, 1), "swimmer": Robot(5, 5, 0.01, 4)}
+ROBOTS = {
+    "ant": Robot(15, 14, 0.02, 5),
+    "point": Robot(3, 3, 0.02, 1),
+    "swimmer": Robot(5, 5, 0.01, 4),
+}
 
 
 def read_grid(grid, scale):
-    """The cells of a text grid as (character, x, y) in reading order; centers (x, y) in m, the robot's at (0, 0)."""
+    """The cells of a text grid as (character, x, y), in reading order.
+
+    (x, y) is the cell's center in m; the robot's is (0, 0).
+    """
     rows = grid.split()
     row0, col0 = next((i, row.index("R")) for i, row in enumerate(rows) if "R" in row)
-    return [(c, (j - col0) * scale, (i - row0) * scale) for i, row in enumerate(rows) for j, c in enumerate(row)]
+    cells = [(i, j, c) for i, row in enumerate(rows) for j, c in enumerate(row)]
+    return [(c, (j - col0) * scale, (i - row0) * scale) for i, j, c in cells]
 
 
 def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
-    """The robot's model from Gymnasium, changed to mujoco-maze's, with the maze around it. Returns a mujoco.MjModel."""
-    spec = mujoco.MjSpec.from_file(str(Path(gym.__file__).parent / f"envs/mujoco/assets/{robot}.xml"))
+    """The robot's model from Gymnasium, changed to mujoco-maze's, with the maze around it.
+
+    Returns a mujoco.MjModel.
+    """
+    assets = Path(gym.__file__).parent / "envs/mujoco/assets"
+    spec = mujoco.MjSpec.from_file(str(assets / f"{robot}.xml"))
     spec.option.timestep = ROBOTS[robot].timestep
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # same contacts; the ant's steps take 10 % less
+    # Without the midphase, which is younger than the study's MuJoCo 2.1.0, the ant's steps take
+    # 10 % less time and are the same. The point's contacts come in another order: with the midphase
+    # 1.2 % of its steps at walls end elsewhere (measured: up to 2 cm, 2 m/s), the rest to rounding.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     has_blocks = any(c == "M" for c, _, _ in cells)
     if robot == "ant":
         for actuator in spec.actuators:
@@ -130,19 +148,22 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
     floor.reflectance, tiles.rgb1, tiles.rgb2 = 0, [0.80, 0.82, 0.85], [0.70, 0.72, 0.76]
 
     height = scale / 2
-    box = dict(type=mujoco.mjtGeom.mjGEOM_BOX, size=[scale / 2, scale / 2, height / 2], contype=1, conaffinity=1)
+    size = [scale / 2, scale / 2, height / 2]
+    box = dict(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, contype=1, conaffinity=1)
     for i, (c, x, y) in enumerate(cells):
         if c == "#":
-            spec.worldbody.add_geom(**box, name=f"wall_{i}", pos=[x, y, height / 2], rgba=[0.35, 0.4, 0.5, 1])
+            wall = spec.worldbody.add_geom(**box, name=f"wall_{i}", pos=[x, y, height / 2])
+            wall.rgba = [0.35, 0.4, 0.5, 1]
         elif c == "M":
             body = spec.worldbody.add_body(name=f"block_{i}", pos=[x, y, height / 2])
             body.add_geom(**box, name=f"block_{i}", mass=0.0002, rgba=[0.75, 0.15, 0.2, 1])
             for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0])):
-                joint = body.add_joint(name=f"block_{i}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-                joint.limited, joint.armature, joint.damping, joint.margin = 0, 0, [0, 0, 0], 0.01
+                joint = body.add_joint(name=f"block_{i}_{name}", axis=axis)
+                joint.type, joint.margin = mujoco.mjtJoint.mjJNT_SLIDE, 0.01
+                joint.limited, joint.armature, joint.damping = 0, 0, [0, 0, 0]
     # A post as wide as the goal, which stands out of the wall where the goal is inside one.
-    post = dict(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[GOAL_RADIUS, 0.7 * height, 0], rgba=[0.1, 0.7, 0.1, 1])
-    spec.worldbody.add_site(**post, name="goal", pos=[*goal, 0.7 * height])
+    post = spec.worldbody.add_site(name="goal", pos=[*goal, 0.7 * height], rgba=[0.1, 0.7, 0.1, 1])
+    post.type, post.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [GOAL_RADIUS, 0.7 * height, 0]
 
     model = spec.compile()
     if old_capsule_inertia:
@@ -151,28 +172,34 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
 
 
 def set_old_capsule_inertia(model):
-    """Give every body made of one capsule the mass and inertia that MuJoCo computed until 2.1.1, in place.
+    """Give every body made of one capsule the mass and inertia of MuJoCo before 2.1.2, in place.
 
-    A capsule of radius r and cylinder length L was taken for a cylinder of height h = L + r. The swimmer's fluid drag
-    and so its returns depend on it: the published ones need the old values.
+    A capsule of radius r and cylinder length L was taken for a cylinder of height h = L + r. The
+    swimmer's fluid drag and so its returns depend on it: the published ones need the old values.
     """
     for body in range(1, model.nbody):
         first, count = model.body_geomadr[body], model.body_geomnum[body]
         if count == 1 and model.geom_type[first] == mujoco.mjtGeom.mjGEOM_CAPSULE:
             r, half_length, _ = model.geom_size[first]
             h = 2 * half_length + r
-            mass = model.body_mass[body] * h / (h + r / 3)  # the exact volume is pi r^2 (L + 4 r / 3)
+            mass = (
+                model.body_mass[body] * h / (h + r / 3)
+            )  # the exact volume is pi r^2 (L + 4 r / 3)
             across = mass * (3 * r**2 + h**2) / 12
             model.body_mass[body] = mass
-            model.body_inertia[body] = [across, across, mass * r**2 / 2]  # the capsule's axis is the third
+            model.body_inertia[body] = [
+                across,
+                across,
+                mass * r**2 / 2,
+            ]  # the capsule's axis is the third
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 class WallReflection:
     """Reflects the point's moves at the faces of the walls, which stand out by the point's radius.
 
-    The original has no face where a wall adjoins the first cell of a block. Its point can leave PushMaze there; this
-    one cannot.
+    The original has no face where a wall adjoins the first cell of a block. Its point can leave
+    PushMaze there; this one cannot.
     """
 
     def __init__(self, cells, scale):
@@ -182,11 +209,14 @@ class WallReflection:
         for c, x, y in cells:
             for axis, dx, dy in ((1, 0, -1), (0, -1, 0), (1, 0, 1), (0, 1, 0)):
                 if c == "#" and (x + dx * scale, y + dy * scale) in free:
-                    across, along = (x + dx * reach, y) if axis == 0 else (y + dy * reach, x)
+                    across, along = (y + dy * reach, x) if axis else (x + dx * reach, y)
                     self.faces.append((axis, across, along - reach, along + reach))
 
     def first_crossing(self, start, end):
-        """The nearest crossing of the segment start-end with a face: (distance / length, face), or None."""
+        """The nearest crossing of the segment start-end with a face.
+
+        Returns (distance / length, face), or None.
+        """
         nearest = None
         delta = (end[0] - start[0], end[1] - start[1])
         for face in self.faces:
@@ -194,12 +224,13 @@ class WallReflection:
             a, b = start[axis] - across, end[axis] - across
             if a * b <= 0 and a != b:
                 t = a / (a - b)
-                if low <= start[1 - axis] + t * delta[1 - axis] <= high and (nearest is None or t < nearest[0]):
+                on_face = low <= start[1 - axis] + t * delta[1 - axis] <= high
+                if on_face and (nearest is None or t < nearest[0]):
                     nearest = (t, face)
         return nearest
 
     def __call__(self, start, end):
-        """Where a move from start to end arrives. Points are (x, y); returns `end` itself if no wall is in the way."""
+        """Where a move from start to end, (x, y), arrives: at `end` if no wall is in the way."""
         hit = self.first_crossing(start, end)
         if hit is None:
             return end
@@ -218,15 +249,19 @@ class MazeEnv(gym.Env):
         robot: "ant", "point" or "swimmer".
         maze: a key of `MAZES`.
         goal: (x, y) in m from the center of the robot's cell; default: the maze's own.
-        old_capsule_inertia: masses and inertias as in MuJoCo before 2.1.2, with which the published results were made.
+        old_capsule_inertia: masses and inertias as in MuJoCo before 2.1.2, with which the published
+            results were made.
         render_mode: None or "rgb_array": the whole maze from above, (480, 480, 3) uint8.
 
-    Action: joint torques in [-30, 30] N m (ant, 8) or [-1, 1] times 150 N m (swimmer, 2); for the point a step forward
-    in [-1, 1] m and, before it, a turn in [-0.25, 0.25] rad. Actions beyond are clipped.
-    Observation: the robot's first three coordinates, the position (x, y, z) of each block, the robot's other
-    coordinates, its velocities, 0.001 * step.
-    Reward: 1 within 0.6 m of the goal, which terminates the episode, otherwise -0.0001; for ant and swimmer also
-    0.01 * (speed in m/s - 1e-4 * sum(action^2)). `info["success"]` says whether the goal is reached.
+    Action: joint torques in [-30, 30] N m (ant, 8) or [-1, 1] times 150 N m (swimmer, 2); for the
+    point a step forward in [-1, 1] m and, before it, a turn in [-0.25, 0.25] rad. Actions beyond
+    are clipped.
+    Observation: the robot's first three coordinates, the position (x, y, z) of each block, the
+    robot's other coordinates, its velocities, 0.001 * step.
+    Reward: 1 within 0.6 m of the goal, which terminates the episode, otherwise -0.0001; for ant and
+    swimmer also 0.01 * (speed in m/s - 1e-4 * sum(action^2)).
+    Info: `success`, whether the goal is reached; `position`, the robot's (x, y) in m; for ant and
+    swimmer `reward_forward` and `reward_ctrl`, the speed and -1e-4 * sum(action^2).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}
@@ -234,7 +269,9 @@ class MazeEnv(gym.Env):
     def __init__(self, robot, maze, goal=None, old_capsule_inertia=True, render_mode=None):
         if maze not in MAZES or robot not in MAZES[maze].scale:
             choices = ", ".join(f"{r} in {m}" for m in MAZES for r in MAZES[m].scale)
-            raise ValueError(f"no maze task for robot {robot!r} in maze {maze!r}; there are {choices}")
+            raise ValueError(
+                f"no maze task for robot {robot!r} in maze {maze!r}; there are {choices}"
+            )
         self.robot, self.render_mode = robot, render_mode
         self.nq, self.nv, timestep, self.substeps = ROBOTS[robot]
         self.dt = timestep * self.substeps
@@ -246,19 +283,36 @@ class MazeEnv(gym.Env):
         self.reflect = WallReflection(self.cells, scale)
         self.model = build_model(robot, self.cells, scale, self.goal, old_capsule_inertia)
         self.data = mujoco.MjData(self.model)
-        # Views into MuJoCo's memory, kept because making one takes as long as using it.
-        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
-        n_blocks = (self.model.nq - self.nq) // 2
-        self._block_pos = self.data.xpos[self.model.nbody - n_blocks :].reshape(-1)  # (3 * n_blocks,)
+        self._make_views()
 
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.nq + self.nv + 3 * n_blocks + 1,), np.float64)
+        obs_dim = self.nq + self.nv + self._block_pos.size + 1
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (obs_dim,), np.float64)
         self._low, self._high = self.model.actuator_ctrlrange.T.copy()
         self._renderer = None
 
+    def _make_views(self):
+        # Views into MuJoCo's memory, kept because making one takes as long as using it.
+        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        n_blocks = (self.model.nq - self.nq) // 2
+        first = self.model.nbody - n_blocks
+        self._block_pos = self.data.xpos[first:].reshape(-1)  # (3 * n_blocks,)
+
+    # copy and pickle would make the views arrays of their own, and cannot take a renderer
+    def __getstate__(self):
+        left_out = {"_qpos", "_qvel", "_ctrl", "_block_pos", "_renderer", "_camera"}
+        return {name: value for name, value in self.__dict__.items() if name not in left_out}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state, _renderer=None)
+        self._make_views()
+
     def reset(self, *, seed=None, options=None):
-        """Start an episode: coordinates and velocities drawn around the model's own, blocks at rest in place."""
+        """Start an episode: coordinates and velocities are drawn around the model's own.
+
+        Blocks are at rest in place.
+        """
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self._steps = 0
@@ -271,9 +325,19 @@ class MazeEnv(gym.Env):
         return self._observation(), {}
 
     def step(self, action):
-        """One step of `dt` seconds with an action of shape (action_dim,)."""
-        self._steps += 1
+        """One step of `dt` seconds with an action of shape (action_dim,).
+
+        Raises ValueError for an action of another shape or with NaN.
+        """
+        action = np.asarray(action)
+        if action.shape != self._low.shape:
+            raise ValueError(f"action of shape {action.shape}, need {self._low.shape}")
         action = np.minimum(np.maximum(action, self._low), self._high)
+        square = float(action @ action)
+        if math.isnan(square):
+            raise ValueError(f"action with NaN: {action.tolist()}")
+        self._steps += 1
+        info = {}
         if self.robot == "point":
             self._move_point(*action.tolist())
             reward = 0.0
@@ -282,13 +346,16 @@ class MazeEnv(gym.Env):
             self._ctrl[:] = action
             mujoco.mj_step(self.model, self.data, self.substeps)
             speed = math.hypot(self._qpos[0] - x, self._qpos[1] - y) / self.dt
-            reward = INNER_REWARD * (speed - CONTROL_COST * float(action @ action))
-        reached = math.hypot(self._qpos[0] - self.goal[0], self._qpos[1] - self.goal[1]) <= GOAL_RADIUS
+            info = {"reward_forward": speed, "reward_ctrl": -CONTROL_COST * square}
+            reward = INNER_REWARD * (speed - CONTROL_COST * square)
+        x, y = self._qpos[:2].tolist()
+        reached = math.hypot(x - self.goal[0], y - self.goal[1]) <= GOAL_RADIUS
         reward += 1.0 if reached else STEP_REWARD
-        return self._observation(), reward, reached, False, {"success": reached}
+        info |= {"success": reached, "position": np.array([x, y])}
+        return self._observation(), reward, reached, False, info
 
     def _move_point(self, forward, turn):
-        """Turn and move the point by changing its coordinates, let the physics do one step, then mind the walls."""
+        """Turn and move the point by its coordinates, step the physics, then mind the walls."""
         x, y, heading = self._qpos[:3].tolist()
         heading += turn
         if abs(heading) > math.pi:
@@ -300,22 +367,31 @@ class MazeEnv(gym.Env):
 
     def _observation(self):
         nq, nv = self.nq, self.nv
-        if self._block_pos.size:  # mj_step leaves positions where the integrator's last stage had them
+        if self._block_pos.size:  # mj_step leaves them where the integrator's last stage had them
             mujoco.mj_kinematics(self.model, self.data)
-        parts = (self._qpos[:3], self._block_pos, self._qpos[3:nq], self._qvel[:nv], (0.001 * self._steps,))
+        parts = (
+            self._qpos[:3],
+            self._block_pos,
+            self._qpos[3:nq],
+            self._qvel[:nv],
+            (0.001 * self._steps,),
+        )
         return np.concatenate(parts)
 
     def render(self):
-        """The maze from above as an RGB image, (480, 480, 3) uint8, if `render_mode` is "rgb_array"."""
+        """The maze from above, RGB (480, 480, 3) uint8, if `render_mode` is "rgb_array"."""
         if self.render_mode is None:
             return None
         if self._renderer is None:
             self._renderer = mujoco.Renderer(self.model, 480, 480)
-            weakref.finalize(self, self._renderer.close)  # at exit at the latest, while OpenGL still works
+            weakref.finalize(
+                self, self._renderer.close
+            )  # at exit at the latest, while OpenGL still works
             xy = np.array([(x, y) for _, x, y in self.cells])
             self._camera = mujoco.MjvCamera()
             self._camera.lookat = [*(xy.min(0) + xy.max(0)) / 2, 0]
-            self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.55 * np.ptp(xy, 0).max(), 90, -65
+            self._camera.distance = 1.55 * np.ptp(xy, 0).max()
+            self._camera.azimuth, self._camera.elevation = 90, -65
         mujoco.mj_kinematics(self.model, self.data)
         self._renderer.update_scene(self.data, self._camera)
         return self._renderer.render()

@@ -1,4 +1,4 @@
-"""The benchmark: its contenders do a round's work, all of a round's time is in its phases, and the table adds up."""
+"""The benchmark: contenders do a round's work, its time is in its phases, the table adds up."""
 
 import json
 import subprocess
@@ -10,19 +10,20 @@ from conftest import ROOT
 
 from benchmark import PHASES, measure
 
-# Plays rounds that are smaller than the real ones, and prints of each: the report, the seconds it took, the car's steps
+# Plays small rounds, and prints of each: the report, the seconds it took, the car's steps
 PLAY = """
 import json, sys, time
 from gymnasium.envs.classic_control.continuous_mountain_car import Continuous_MountainCarEnv as Car
 import benchmark
-import ppo_colored_continuous as ppo
+import run_files
 
 class Pipe:
     rounds = []
     def send(self, report):
         if self.rounds:
             start, steps = self.rounds.pop()
-            self.rounds.append(dict(report=report, wall=time.perf_counter() - start, steps=Car.steps - steps))
+            wall, steps = time.perf_counter() - start, Car.steps - steps
+            self.rounds.append(dict(report=report, wall=wall, steps=steps))
     def recv(self):
         self.rounds.append((time.perf_counter(), Car.steps))
         return len(self.rounds) <= 3
@@ -32,7 +33,7 @@ def step(self, action):
     return car_step(self, action)
 
 car_step, Car.step, Car.steps = Car.step, step, 0
-ppo.compile_update = lambda update, example: update
+run_files.compiled = lambda update: update
 benchmark.N_STEPS, benchmark.STEPS, benchmark.EVAL_EPISODES = 64, 256, 10
 clock, car = benchmark.Clock(Pipe()), "MountainCarContinuous-v0"
 try:
@@ -46,33 +47,46 @@ except SystemExit:
     "call, steps",
     [
         (
-            "run_script(clock, car)",
+            "run_script(clock, car, '--no-envpool')",
             256 + 10 * 999,
         ),  # training, and evaluations, in which the car is not yet at the goal
-        ("run_script(clock, car, envpool=True, n_envs=2, evaluations=False)", 0),
-        ("run_paper_stack(clock, car)", 256 + 10 * 999),
+        ("run_script(clock, car, flags='--envpool', n_envs=2, evaluations=False)", 0),
+        ("run_peer(clock, car)", 256 + 10 * 999),
+        ("run_peer(clock, car, jax=True)", 256 + 10 * 999),
         ("run_eager(clock, car)", 256 + 10 * 999),
         ("run_physics(clock, 'dm_control/pendulum-swingup-v0')", 0),
     ],
 )
 def test_a_round(call, steps):
+    if "jax" in call:
+        pytest.importorskip("sbx")
     process = subprocess.run(
         [sys.executable, "-c", PLAY, "benchmark." + call], cwd=ROOT, capture_output=True, text=True
     )
     assert process.returncode == 0, process.stderr
     rounds = json.loads(process.stdout)
     assert len(rounds) == 3
-    phases = {"rollout", "update", "evaluation"} | ({"noise", "files"} if "script" in call else set())
-    phases -= {"update"} if "physics" in call else {"evaluation"} if "evaluations=False" in call else set()
+    phases = {"rollout", "update", "evaluation"} | (
+        {"noise", "files"} if "script" in call else set()
+    )
+    phases -= (
+        {"update"}
+        if "physics" in call
+        else {"evaluation"}
+        if "evaluations=False" in call
+        else set()
+    )
     for one in rounds:
         assert one["steps"] == steps
         assert {phase for phase in PHASES if one["report"][phase] > 0} == phases
         if "physics" not in call:  # which leaves its resets out
-            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(one["wall"], rel=0.02, abs=0.01)
+            assert sum(one["report"][phase] for phase in PHASES) == pytest.approx(
+                one["wall"], rel=0.02, abs=0.01
+            )
 
 
 def slow_then_fast(clock, env_id):
-    """A contender that takes 10, 20, 30, 40 ms for its updates, and a tenth of that for the rest."""
+    """A contender whose updates take 10, 20, 30, 40 ms, and the rest a tenth of that."""
     for ms in (10, 20, 30, 40):
         clock.next_round()
         clock.seconds.update(rollout=ms / 1e4, update=ms / 1e3, evaluation=ms / 1e4)

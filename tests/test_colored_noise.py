@@ -1,16 +1,22 @@
+import io
+import math
+
 import colorednoise
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
+import plot
 from colored_noise import (
+    PUBLISHED_BEST_BETA,
     ColoredNoiseProcess,
     autocovariance,
     colored_noise,
     expected_psd,
     marginal_variance,
     mean_std,
+    projected_beta,
 )
 
 BETAS = [-1, 0, 0.2, 0.5, 0.75, 1, 1.25, 2]
@@ -40,7 +46,9 @@ def test_draws_agree_with_the_closed_forms(beta, T):
     assert torch.allclose(x.var(0), marginal_variance(beta, T).expand(T), rtol=error)
     assert x.mean(1).std().item() == pytest.approx(mean_std(beta, T).item(), rel=error)
     covariance = (x[:, :1] * x).mean(0)
-    assert torch.allclose(covariance, autocovariance(beta, T), atol=error * marginal_variance(beta, T).item())
+    assert torch.allclose(
+        covariance, autocovariance(beta, T), atol=error * marginal_variance(beta, T).item()
+    )
 
 
 def test_closed_forms_have_the_published_values():
@@ -59,14 +67,22 @@ def test_agrees_with_the_colorednoise_package_in_distribution(beta, T):
     theirs = colorednoise.powerlaw_psd_gaussian(beta, (n, T), random_state=1)
     ours = draw(beta, n, T).numpy()
     # single values, steps, and sequence means: marginal, two-step correlation and the DC bin
-    for feature in (lambda x: x[:, 3], lambda x: x[:, 4] - x[:, 3], lambda x: x.mean(1), lambda x: x[:, 3] + x[:, 50]):
+    for feature in (
+        lambda x: x[:, 3],
+        lambda x: x[:, 4] - x[:, 3],
+        lambda x: x.mean(1),
+        lambda x: x[:, 3] + x[:, 50],
+    ):
         assert stats.ks_2samp(feature(ours), feature(theirs)).pvalue > 1e-3
     ours_psd, theirs_psd = (np.mean(np.abs(np.fft.rfft(x)) ** 2, axis=0) for x in (ours, theirs))
     np.testing.assert_allclose(ours_psd, theirs_psd, rtol=5 * (2 / n) ** 0.5 * 2**0.5)
 
 
 def test_same_as_the_colorednoise_package_on_the_same_random_numbers(monkeypatch):
-    """With its normal draws fed to ours, the sequences are equal: scales, special bins and sigma are all the same."""
+    """With its normal draws fed to ours, the sequences are equal.
+
+    So scales, special bins and sigma are all the same.
+    """
     for T in (100, 101):
         for beta in BETAS:
             theirs = colorednoise.powerlaw_psd_gaussian(beta, T, random_state=7)
@@ -75,7 +91,9 @@ def test_same_as_the_colorednoise_package_on_the_same_random_numbers(monkeypatch
             rng = np.random.default_rng(7)
             real, imaginary = (rng.normal(scale=s) / s for _ in range(2))
             normals = torch.tensor(np.stack([real, imaginary], -1), dtype=torch.float32)
-            monkeypatch.setattr(torch, "randn", lambda *size, normals=normals, **_: normals.reshape(size).clone())
+            monkeypatch.setattr(
+                torch, "randn", lambda *size, normals=normals, **_: normals.reshape(size).clone()
+            )
             ours = colored_noise(beta, (T,))
             monkeypatch.undo()
             np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=2e-5)
@@ -99,7 +117,7 @@ def test_one_beta_per_action_dimension():
 
 
 def test_process_continues_over_the_ends_of_sequences():
-    """The same values come out one by one and in blocks of any length, across redraws; shapes are as documented."""
+    """The same values come out one by one and in blocks of any length, across redraws."""
     make = lambda: ColoredNoiseProcess(0.5, n_envs=2, action_dim=3, seq_len=10, seed=3)  # noqa: E731
     one, block = make(), make()
     singles = torch.stack([one.sample() for _ in range(35)])
@@ -118,8 +136,92 @@ def test_state_is_restored_in_mid_sequence():
     other = ColoredNoiseProcess(1.0, 2, 1, seq_len=10, seed=99)
     other.load_state_dict(state)
     assert torch.equal(other.sample(30), expected)
-    with pytest.raises(ValueError, match="noise state"):
-        ColoredNoiseProcess(1.0, 3, 1, seq_len=10).load_state_dict(state)
+    assert other.index == process.index and torch.equal(other.buffer, process.buffer)
+    per_dimension = ColoredNoiseProcess([1.0], 2, 1, seq_len=10)  # the same beta, written otherwise
+    per_dimension.load_state_dict(state)
+    assert torch.equal(per_dimension.sample(30), expected)
+    for beta, n_envs, seq_len in [(1.0, 3, 10), (1.0, 2, 11), (1.1, 2, 10)]:
+        with pytest.raises(ValueError, match="noise state of (beta|size)"):
+            ColoredNoiseProcess(beta, n_envs, 1, seq_len=seq_len).load_state_dict(state)
+
+
+@pytest.mark.parametrize("n_sampled", [0, 9, 10, 25])
+def test_a_state_is_small_and_continues_wherever_it_was_taken(n_sampled):
+    """Also before the first value and at a sequence's end; through a file, as in a checkpoint."""
+    process = ColoredNoiseProcess([0.0, 1.0], 3, 2, seq_len=10, seed=3)
+    process.sample(n_sampled)
+    file = io.BytesIO()
+    torch.save(process.state_dict(), file)
+    expected = process.sample(30)
+    file.seek(0)
+    other = ColoredNoiseProcess([0.0, 1.0], 3, 2, seq_len=10)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(other.sample(30), expected)
+    big = io.BytesIO()
+    torch.save(ColoredNoiseProcess(0.5, 4, 1, seq_len=100_000, seed=1).state_dict(), big)
+    assert len(big.getvalue()) < 20_000  # bytes; the sequences are 1.6 MB
+
+
+def test_processes_without_a_seed_differ():
+    first, second = (ColoredNoiseProcess(0.5, 2, 2, seq_len=10) for _ in range(2))
+    assert not torch.equal(first.sample(10), second.sample(10))
+
+
+def test_integers_of_numpy():
+    process = ColoredNoiseProcess(0.5, *np.array([2, 3, 10]), seed=np.int64(3))
+    plain = ColoredNoiseProcess(0.5, 2, 3, 10, seed=3)
+    assert torch.equal(process.sample(np.int64(12)), plain.sample(12))
+    assert process.size == (2, 3, 10) and all(type(n) is int for n in process.size)
+    assert colored_noise(0.5, np.int64(10)).shape == (10,)
+    assert colored_noise(0.5, np.array([2, 10])).shape == (2, 10)
+    with pytest.raises(TypeError):
+        colored_noise(0.5, 10.0)
+
+
+def test_no_steps():
+    process = ColoredNoiseProcess(0.5, 2, 3, seq_len=10, seed=3)
+    assert process.sample(0).shape == (0, 2, 3) and process.index == 0
+    process.sample(10)
+    assert process.sample(0).shape == (0, 2, 3)
+    with pytest.raises(ValueError, match="negative"):
+        process.sample(-1)
+
+
+def test_the_default_dtype_does_not_matter():
+    plain, closed = draw(0.5, 3, 10), mean_std(0.5, 10)
+    torch.set_default_dtype(torch.float64)
+    try:
+        noise = colored_noise(0.5, (3, 10), generator=torch.Generator().manual_seed(0))
+        assert noise.dtype == torch.float32 and torch.equal(noise.double(), plain)
+        assert ColoredNoiseProcess(0.5, 2, 3).sample().dtype == torch.float32
+        assert mean_std(0.5, 10).dtype == torch.float64 and torch.equal(mean_std(0.5, 10), closed)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_projected_beta_solves_the_papers_argument():
+    best = plot.published("best_beta_per_n_envs").set_index("n_envs").best_beta
+    assert best.to_dict() == PUBLISHED_BEST_BETA
+    star = np.mean([mean_std(beta, 1000).item() / n**0.5 for n, beta in best.items()])
+    betas = [projected_beta(n) for n in best.index]
+    for n, beta in zip(best.index, betas, strict=True):
+        assert mean_std(beta, 1000).item() / n**0.5 == pytest.approx(star, rel=1e-6)
+        assert projected_beta(n // 2, 4096) == projected_beta(n) if n > 1 else True
+    # the study's beta that is projected to be best is a neighbor of this one, or the nearest
+    study = np.array([-1, 0, 0.2, 0.5, 0.75, 1, 1.25, 2])
+    firsts = plot.projected_ranks(best, study, list(best.index)).idxmin()
+    for first, beta in zip(firsts, betas, strict=True):
+        below, above = study[study <= beta].max(), study[study >= beta].min()
+        assert first in (below, above)
+    assert mean_std(projected_beta(8, seq_len=200), 200).item() / 8**0.5 == pytest.approx(star)
+
+
+def test_projected_beta_stays_in_the_studys_range():
+    assert projected_beta(1, n_steps=1) == -1 and projected_beta(100_000) == 2
+    assert np.all(np.diff([projected_beta(n) for n in range(1, 130, 9)]) > 0)
+    for sizes in [(0, 2048), (4, 0), (4, -1), (math.nan, 2048)]:
+        with pytest.raises(ValueError, match="positive"):
+            projected_beta(*sizes)
 
 
 def test_draws_do_not_touch_the_global_generator():

@@ -1,4 +1,4 @@
-"""The Adroit door against D4RL's reward, written out here and computed from the simulator's state."""
+"""The Adroit door against D4RL's reward, written out here, from the simulator's state."""
 
 import subprocess
 import sys
@@ -17,8 +17,14 @@ ROOT = Path(__file__).parent.parent
 def d4rl_reward(env):
     palm, handle = env.data.site("S_grasp").xpos, env.data.site("S_handle").xpos
     hinge = env.data.joint("door_hinge").qpos[0]
-    reward = -0.1 * np.linalg.norm(palm - handle) - 0.1 * (hinge - 1.57) ** 2 - 1e-5 * np.sum(env.data.qvel**2)
-    return reward + (2 if hinge > 0.2 else 0) + (8 if hinge > 1.0 else 0) + (10 if hinge > 1.35 else 0)
+    reward = (
+        -0.1 * np.linalg.norm(palm - handle)
+        - 0.1 * (hinge - 1.57) ** 2
+        - 1e-5 * np.sum(env.data.qvel**2)
+    )
+    return (
+        reward + (2 if hinge > 0.2 else 0) + (8 if hinge > 1.0 else 0) + (10 if hinge > 1.35 else 0)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +38,11 @@ def test_reward_is_d4rls_at_random_states(door):
         door.reset(seed=seed)
         for _ in range(40):
             obs, reward, terminated, truncated, _ = door.step(rng.uniform(-1, 1, 28))
-            assert reward == pytest.approx(d4rl_reward(door), rel=1e-12) and not terminated and not truncated
+            assert (
+                reward == pytest.approx(d4rl_reward(door), rel=1e-12)
+                and not terminated
+                and not truncated
+            )
             palm, handle = door.data.site("S_grasp").xpos, door.data.site("S_handle").xpos
             np.testing.assert_array_equal(obs[-4:-1], palm - handle)
 
@@ -59,7 +69,10 @@ def test_the_packages_reward_differs(door):
     for env in (door, package):
         env.reset(seed=5)
     for action in np.random.default_rng(0).uniform(-1, 1, (20, 28)):
-        (obs, reward, *_), (package_obs, package_reward, *_) = door.step(action), package.step(action)
+        (obs, reward, *_), (package_obs, package_reward, *_) = (
+            door.step(action),
+            package.step(action),
+        )
         np.testing.assert_array_equal(obs, package_obs)
         distance = np.linalg.norm(obs[-4:-1])
         assert distance > 0.1 and package_reward - reward == pytest.approx(0.2 * distance, rel=1e-9)
@@ -85,7 +98,9 @@ def test_episodes_last_200_steps_and_depend_on_the_seed_only():
 @pytest.mark.filterwarnings("ignore")  # it recommends bounds
 def test_gymnasium_checks(door):
     check_env(door, skip_render_check=True)
-    assert door.observation_space.shape == (39,) and door.action_space == gym.spaces.Box(-1, 1, (28,), np.float32)
+    assert door.observation_space.shape == (39,) and door.action_space == gym.spaces.Box(
+        -1, 1, (28,), np.float32
+    )
     envs = gym.make_vec("door-v0", num_envs=2, vectorization_mode="sync")
     assert envs.reset(seed=0)[0].shape == (2, 39)
 
@@ -96,7 +111,9 @@ def python(code):
 
 def test_importing_is_quick_and_making_a_door_silent():
     slow = ["mujoco", "gymnasium_robotics", "dm_control", "shimmy", "torch", "envpool"]
-    done = python(f"import sys, environments; print([name for name in {slow} if name in sys.modules])")
+    done = python(
+        f"import sys, environments; print([name for name in {slow} if name in sys.modules])"
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")
     done = python("import environments, gymnasium; gymnasium.make('door-v0').reset()")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

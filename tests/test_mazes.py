@@ -1,6 +1,8 @@
 """The mazes against figures worked out by hand from the original's rules."""
 
+import copy
 import math
+import pickle
 
 import gymnasium as gym
 import mujoco
@@ -38,7 +40,7 @@ def robot_of(env_id):
 
 
 def place(env, x, y, **velocities):
-    """Puts the robot at (x, y), upright and at rest but for the given velocities by coordinate number."""
+    """Puts the robot at (x, y), upright, at rest but for these velocities (v0 of coordinate 0)."""
     env.reset(seed=0)
     mujoco.mj_resetData(env.model, env.data)
     env.data.qpos[:2] = x, y
@@ -47,10 +49,14 @@ def place(env, x, y, **velocities):
 
 
 def walls_of(env_id):
-    """The walls' centers (n, 2), side and height in m, from the compiled model instead of the grid."""
+    """The walls' centers (n, 2), side and height in m, from the compiled model, not the grid."""
     model = make(env_id).model
     walls = [i for i in range(model.ngeom) if model.geom(i).name.startswith("wall")]
-    return model.geom_pos[walls][:, :2], 2 * model.geom_size[walls[0], 0], model.geom_size[walls[0], 2] * 2
+    return (
+        model.geom_pos[walls][:, :2],
+        2 * model.geom_size[walls[0], 0],
+        model.geom_size[walls[0], 2] * 2,
+    )
 
 
 # Cells that are not walls, (x, y) counted from the robot's.
@@ -59,7 +65,13 @@ FREE = {
     "UMaze": [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 2)],
     "4Rooms": [*ROOMS, (3, -5), (3, -1), (1, -3), (5, -3)],  # and the doors between them
     "Push": [(-1, 0), (0, 0), (-1, 1), (0, 1), (1, 1), (0, 2)],
-    "PushMaze": [*((x, 0) for x in range(-2, 3)), (1, 1), *((x, 2) for x in range(-2, 2)), (-1, 3), (1, 3)],
+    "PushMaze": [
+        *((x, 0) for x in range(-2, 3)),
+        (1, 1),
+        *((x, 2) for x in range(-2, 2)),
+        (-1, 3),
+        (1, 3),
+    ],
 }
 
 
@@ -82,13 +94,16 @@ def test_spaces_and_gymnasium_checks(env_id):
     env = make(env_id)
     check_env(env, skip_render_check=True)
     assert gym.spec(env_id).max_episode_steps == 1000
+    assert gym.spec(env_id).reward_threshold == 0.9  # the original's
     np.testing.assert_array_equal(env.action_space.high, np.float32(high))
     np.testing.assert_array_equal(env.action_space.low, -np.float32(high))
     assert env.action_space.dtype == np.float32
     assert env.observation_space == gym.spaces.Box(-np.inf, np.inf, (obs_dim,), np.float64)
     assert env.goal == goal and env.dt == pytest.approx(dt)
     assert env.metadata["render_fps"] == round(1 / dt)
-    with pytest.raises(ValueError, match="no maze task for robot 'swimmer' in maze 'Push'; there are ant in UMaze"):
+    with pytest.raises(
+        ValueError, match="no maze task for robot 'swimmer' in maze 'Push'; there are ant in UMaze"
+    ):
         MazeEnv("swimmer", "Push")
 
 
@@ -122,8 +137,12 @@ def test_reset_ranges(env_id):
     env = make(env_id)
     obs = np.array([env.reset(seed=i)[0] for i in range(300)])
     n_block = 3 * len(blocks)
-    coordinates = np.concatenate([obs[:, :3], obs[:, 3 + n_block : nq + n_block]], axis=1) - QPOS0[robot]
-    assert (abs(coordinates).max(axis=0) <= 0.1).all() and (abs(coordinates).max(axis=0) > 0.095).all()
+    coordinates = (
+        np.concatenate([obs[:, :3], obs[:, 3 + n_block : nq + n_block]], axis=1) - QPOS0[robot]
+    )
+    assert (abs(coordinates).max(axis=0) <= 0.1).all() and (
+        abs(coordinates).max(axis=0) > 0.095
+    ).all()
     np.testing.assert_allclose(coordinates.std(axis=0), 0.2 / math.sqrt(12), rtol=0.15)
     velocities = obs[:, nq + n_block : -1]
     assert velocities.shape == (300, nv) and (obs[:, -1] == 0).all()
@@ -133,7 +152,9 @@ def test_reset_ranges(env_id):
     else:
         assert abs(velocities).max() > 0.25
         np.testing.assert_allclose(velocities.std(axis=0), 0.1, rtol=0.2)
-    side = {"PointPush-v1": 4, "PointPushMaze-v1": 6, "AntPush-v1": 8, "AntPushMaze-v1": 2}.get(env_id)
+    side = {"PointPush-v1": 4, "PointPushMaze-v1": 6, "AntPush-v1": 8, "AntPushMaze-v1": 2}.get(
+        env_id
+    )
     home = [(x, y, side / 4) for x, y in blocks]
     np.testing.assert_array_equal(obs[:, 3 : 3 + n_block], np.tile(np.ravel(home), (300, 1)))
     assert not env.data.qvel[nv:].any()
@@ -149,15 +170,23 @@ def test_observation_layout_and_reward(env_id):
     for step in range(1, 20):
         action = rng.uniform(-1, 1, len(high)) * high
         obs, reward, terminated, truncated, info = env.step(action)
-        positions = [env.data.qpos[nq + 2 * i : nq + 2 * i + 2] + blocks[i] for i in range(len(blocks))]
+        positions = [
+            env.data.qpos[nq + 2 * i : nq + 2 * i + 2] + blocks[i] for i in range(len(blocks))
+        ]
         heights = [env.model.body(env.model.nbody - 1).pos[2]] * len(blocks)
         blocks_xyz = np.ravel([[*xy, z] for xy, z in zip(positions, heights, strict=True)])
         q, v = env.data.qpos, env.data.qvel
-        np.testing.assert_allclose(obs, [*q[:3], *blocks_xyz, *q[3:nq], *v[:nv], 0.001 * step], atol=1e-12)
+        np.testing.assert_allclose(
+            obs, [*q[:3], *blocks_xyz, *q[3:nq], *v[:nv], 0.001 * step], atol=1e-12
+        )
         speed = math.dist(obs[:2], before[:2]) / dt
         inner = 0 if env_id.startswith("Point") else speed - 1e-4 * sum(a * a for a in action)
         assert reward == pytest.approx(-0.0001 + 0.01 * inner, rel=1e-9)
-        assert (terminated, truncated, info) == (False, False, {"success": False})
+        assert (terminated, truncated, info["success"]) == (False, False, False)
+        np.testing.assert_array_equal(info.pop("position"), obs[:2])
+        terms = {"reward_forward": speed, "reward_ctrl": -1e-4 * sum(a * a for a in action)}
+        expected = {} if env_id.startswith("Point") else terms  # as in the original
+        assert info == {"success": False, **{k: pytest.approx(v) for k, v in expected.items()}}
         before = obs
 
 
@@ -187,7 +216,9 @@ def test_goal_is_an_argument_because_the_one_of_pushmaze_is_in_the_wall():
     assert env.model.site("goal").pos[:2].tolist() == [-6, 0]
 
 
-@pytest.mark.parametrize("env_id", ["PointPushMaze-v1", "AntPush-v1", "AntUMaze-v1", "SwimmerUMaze-v1"])
+@pytest.mark.parametrize(
+    "env_id", ["PointPushMaze-v1", "AntPush-v1", "AntUMaze-v1", "SwimmerUMaze-v1"]
+)
 def test_trajectories_depend_on_seed_and_actions_only(env_id):
     def trajectory(env, seed):
         env.reset(seed=seed)
@@ -201,9 +232,65 @@ def test_trajectories_depend_on_seed_and_actions_only(env_id):
     first, second_episode = trajectory(used, 7)
     for env in (used, make(env_id)):
         again, second_again = trajectory(env, 7)
-        assert first.tobytes() == again.tobytes() and second_episode.tobytes() == second_again.tobytes()
+        assert (
+            first.tobytes() == again.tobytes()
+            and second_episode.tobytes() == second_again.tobytes()
+        )
     assert abs(trajectory(used, 8)[0] - first).max() > 0.01
     assert abs(second_episode - used.reset(seed=7)[0]).max() > 0.01
+
+
+def through_pickle(env):
+    return pickle.loads(pickle.dumps(env))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, through_pickle])
+@pytest.mark.parametrize("env_id", TASKS)
+def test_copies_go_on_and_start_again_alike(env_id, duplicate):
+    """In mid-episode; the original and the copy do not touch each other."""
+
+    def play(env, n_steps=30):
+        rng = np.random.default_rng(0)
+        high = env.action_space.high
+        steps = [env.step(rng.uniform(-high, high))[:2] for _ in range(n_steps)]
+        return b"".join([obs.tobytes() + np.float64(reward).tobytes() for obs, reward in steps])
+
+    env = gym.make(env_id)
+    env.reset(seed=1)
+    play(env)
+    twin = duplicate(env)
+    assert play(env) == play(twin)
+    assert env.reset()[0].tobytes() == twin.reset()[0].tobytes()  # the generator goes on as well
+    fresh = gym.make(env_id)
+    assert twin.reset(seed=5)[0].tobytes() == fresh.reset(seed=5)[0].tobytes()
+    assert play(twin) == play(fresh)
+
+
+def test_a_copy_renders():
+    env = make("PointUMaze-v1", render_mode="rgb_array")
+    env.reset(seed=1)
+    image = env.render()
+    twin = copy.deepcopy(env)
+    np.testing.assert_array_equal(twin.render(), image)
+    env.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("env_id", ["PointUMaze-v1", "AntUMaze-v1", "SwimmerUMaze-v1"])
+def test_bad_actions_are_refused(env_id):
+    env = make(env_id)
+    before = env.reset(seed=1)[0]
+    n = env.model.nu
+    for action in (np.zeros(n + 1), np.zeros(n - 1), np.zeros((1, n)), np.zeros((n, 1)), 0.5):
+        with pytest.raises(ValueError, match=rf"shape .*, need \({n},\)"):
+            env.step(action)
+    for i in range(n):
+        action = np.zeros(n)
+        action[i] = math.nan
+        with pytest.raises(ValueError, match="NaN"):
+            env.step(action)
+    np.testing.assert_array_equal(env._observation(), before)  # nothing moved
+    env.step([math.inf] * n)  # clipped like any other
 
 
 # --- Robots
@@ -225,37 +312,53 @@ def test_model_parameters():
     assert all(m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 for m in (ant, point, swimmer))
     assert swimmer.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     assert (ant.actuator_gear[:, 0] == 1).all() and (swimmer.actuator_gear[:, 0] == 150).all()
-    assert (ant.geom_solimp[:, :3] == [0.8, 0.8, 0.01]).all() and (ant.geom_solref == [0.02, 1]).all()
+    assert (ant.geom_solimp[:, :3] == [0.8, 0.8, 0.01]).all() and (
+        ant.geom_solref == [0.02, 1]
+    ).all()
     with_blocks = make("AntPush-v1").model
     assert (with_blocks.geom_solimp[:, :3] == [0.995, 0.995, 0.01]).all()
-    for model, others in ((point, [0.9, 0.95, 0.001]), (make("PointPush-v1").model, [0.995, 0.995, 0.01])):
+    for model, others in (
+        (point, [0.9, 0.95, 0.001]),
+        (make("PointPush-v1").model, [0.995, 0.995, 0.01]),
+    ):
         robot = model.geom_bodyid == model.body("torso").id
         assert robot.sum() == 2 and (model.geom_solimp[robot, :3] == [0.9, 0.99, 0.001]).all()
         assert (model.geom_solimp[~robot, :3] == others).all()
     block = with_blocks.body(with_blocks.nbody - 1)
-    assert block.mass == 0.0002 and with_blocks.geom(with_blocks.ngeom - 1).size.tolist() == [4, 4, 2]
+    assert block.mass == 0.0002 and with_blocks.geom(with_blocks.ngeom - 1).size.tolist() == [
+        4,
+        4,
+        2,
+    ]
     joints = [with_blocks.joint(with_blocks.njnt - 2), with_blocks.joint(with_blocks.njnt - 1)]
     assert [j.axis.tolist() for j in joints] == [[1, 0, 0], [0, 1, 0]]
     for joint in joints:
-        assert joint.type == mujoco.mjtJoint.mjJNT_SLIDE and joint.limited == 0 and joint.margin == 0.01
+        assert (
+            joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+            and joint.limited == 0
+            and joint.margin == 0.01
+        )
         assert joint.armature == 0 and not joint.damping.any()
 
 
 def capsule_inertia(density, r, length, old):
-    """Mass and moments about the axis and across it: of a cylinder of height length + r (old), or exact."""
+    """Mass, moments about the axis and across it: a cylinder's of height length + r, or exact."""
     if old:
         h = length + r
         mass = density * math.pi * r**2 * h
         return mass, mass * r**2 / 2, mass * (3 * r**2 + h**2) / 12
     cylinder, balls = density * math.pi * r**2 * length, density * math.pi * r**3 * 4 / 3
     axis = cylinder * r**2 / 2 + balls * 2 * r**2 / 5
-    across = cylinder * (length**2 / 12 + r**2 / 4) + balls * (2 * r**2 / 5 + length**2 / 4 + 3 * length * r / 8)
+    across = cylinder * (length**2 / 12 + r**2 / 4) + balls * (
+        2 * r**2 / 5 + length**2 / 4 + 3 * length * r / 8
+    )
     return cylinder + balls, axis, across
 
 
 @pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize(
-    "env_id, density, r, n_capsules", [("SwimmerUMaze-v1", 1000, 0.1, 3), ("AntPush-v1", 5, 0.08, 12)]
+    "env_id, density, r, n_capsules",
+    [("SwimmerUMaze-v1", 1000, 0.1, 3), ("AntPush-v1", 5, 0.08, 12)],
 )
 def test_capsule_inertia(env_id, density, r, n_capsules, old):
     model = make(env_id).model if old else make(env_id, old_capsule_inertia=False).model
@@ -274,7 +377,9 @@ def test_capsule_inertia(env_id, density, r, n_capsules, old):
         tensor = frame @ np.diag(model.body_inertia[body]) @ frame.T
         expected = across * np.eye(3) + (about - across) * np.outer(axis, axis)
         np.testing.assert_allclose(tensor, expected, atol=1e-9 * across)
-    assert model.body_subtreemass[0] == pytest.approx(model.body_mass.sum(), rel=1e-9)  # mj_setConst ran
+    assert model.body_subtreemass[0] == pytest.approx(
+        model.body_mass.sum(), rel=1e-9
+    )  # mj_setConst ran
     if env_id.startswith("Ant"):
         assert model.body("torso").mass == pytest.approx(5 * 4 / 3 * math.pi * 0.25**3, rel=1e-9)
 
@@ -299,7 +404,9 @@ def test_point_turns_first_then_moves_and_wraps_its_heading():
     env.data.qpos[2] = 3.1
     obs = env.step([0.5, 0.2])[0]
     heading = 3.1 + 0.2 - 2 * math.pi
-    np.testing.assert_allclose(obs[:3], [0.5 * math.cos(heading), 0.5 * math.sin(heading), heading], atol=1e-9)
+    np.testing.assert_allclose(
+        obs[:3], [0.5 * math.cos(heading), 0.5 * math.sin(heading), heading], atol=1e-9
+    )
     place(env, 0, 0)
     env.data.qpos[2] = -3.1
     assert env.step([0, -7])[0][2] == pytest.approx(-3.1 - 0.25 + 2 * math.pi)  # clipped to 0.25
@@ -307,17 +414,38 @@ def test_point_turns_first_then_moves_and_wraps_its_heading():
     assert env.step([0, 0])[0][0] == pytest.approx(0.2)
 
 
-# In PointUMaze a cell is 4 wide. The robot's cell has faces at x = -1.6, y = -1.6 and y = 1.6 (walls at 2, less 0.4);
-# the wall in the middle ends at x = 6 and y = 2, its faces at x = 6.4 and y = 1.6.
+# In PointUMaze a cell is 4 wide. The robot's cell has faces at x = -1.6, y = -1.6 and y = 1.6
+# (walls at 2, less 0.4); the wall in the middle ends at x = 6 and y = 2, its faces are at x = 6.4
+# and y = 1.6.
 REFLECTIONS = {
     "free": ((0, 0), (0.9, 0.3), (0.9, 0.3)),
     "head-on": ((-1, 0), (-2, 0), (-1.28, 0)),  # 0.4 is left at the face; 0.8 of it goes back
-    "oblique": ((-1.2, 0), (-2, 0.5), (-1.28, 0.45)),  # meets the face at (-1.6, 0.25); 0.4 and 0.25 are left
-    "oblique, other axis": ((0, 1.2), (0.6, 2), (0.54, 1.28)),  # at (0.3, 1.6); 0.3 and 0.4 are left
-    "outer corner": ((6.2, 1.4), (6.5, 2.2), (6.455, 1.12)),  # at (6.275, 1.6), before x = 6.4; 0.225 and 0.6 are left
+    "oblique": (
+        (-1.2, 0),
+        (-2, 0.5),
+        (-1.28, 0.45),
+    ),  # meets the face at (-1.6, 0.25); 0.4 and 0.25 are left
+    "oblique, other axis": (
+        (0, 1.2),
+        (0.6, 2),
+        (0.54, 1.28),
+    ),  # at (0.3, 1.6); 0.3 and 0.4 are left
+    "outer corner": (
+        (6.2, 1.4),
+        (6.5, 2.2),
+        (6.455, 1.12),
+    ),  # at (6.275, 1.6), before x = 6.4; 0.225 and 0.6 are left
     "past the outer corner": ((6.5, 1.4), (6.5, 2.4), (6.5, 2.4)),
-    "inner corner": ((-1.3, -1.5), (-1.8, -1.55), (-1.44, -1.546)),  # at (-1.6, -1.53); 0.2 and 0.02 are left
-    "blocked twice": ((-1.5, -1.5), (-2, -1.8), (-1.5, -1.5)),  # reflected at x = -1.6, the rest crosses y = -1.6
+    "inner corner": (
+        (-1.3, -1.5),
+        (-1.8, -1.55),
+        (-1.44, -1.546),
+    ),  # at (-1.6, -1.53); 0.2 and 0.02 are left
+    "blocked twice": (
+        (-1.5, -1.5),
+        (-2, -1.8),
+        (-1.5, -1.5),
+    ),  # reflected at x = -1.6, the rest crosses y = -1.6
 }
 
 
@@ -326,23 +454,35 @@ def test_reflection_at_walls(case):
     start, end, expected = REFLECTIONS[case]
     env = make("PointUMaze-v1")
     np.testing.assert_allclose(env.reflect(start, end), expected, atol=1e-12)
-    env.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # or the walls would push the body meanwhile
+    env.model.opt.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )  # or the walls would push the body meanwhile
     place(env, *start)
     env.data.qpos[2] = heading = math.atan2(end[1] - start[1], end[0] - start[0])
-    np.testing.assert_allclose(env.step([math.dist(start, end), 0])[0][:3], [*expected, heading], atol=1e-12)
+    np.testing.assert_allclose(
+        env.step([math.dist(start, end), 0])[0][:3], [*expected, heading], atol=1e-12
+    )
 
 
 def test_moves_on_a_face():
     reflect = make("PointUMaze-v1").reflect
     assert reflect((-1.6, 0), (-1.6, 0.5)) == (-1.6, 0.5)  # along it: free
-    assert reflect((-1, 0), (-1.6, 0)) == (-1, 0)  # onto it: reflected to where it arrived, which is again on a face
+    assert reflect((-1, 0), (-1.6, 0)) == (
+        -1,
+        0,
+    )  # onto it: reflected to where it arrived, which is again on a face
 
 
 def test_reflection_faces_of_a_single_wall():
-    """A lone wall, side 2, at the origin of its grid's center has four faces at 1.4 from its center, which meet."""
+    """A lone wall of side 2 has four faces at 1.4 from its center, which meet."""
     cells = read_grid("... .#. R..", 2)  # the wall is at (2, -2)
     faces = sorted(WallReflection(cells, 2).faces)
-    expected = [(0, 0.6, -3.4, -0.6), (0, 3.4, -3.4, -0.6), (1, -3.4, 0.6, 3.4), (1, -0.6, 0.6, 3.4)]
+    expected = [
+        (0, 0.6, -3.4, -0.6),
+        (0, 3.4, -3.4, -0.6),
+        (1, -3.4, 0.6, 3.4),
+        (1, -0.6, 0.6, 3.4),
+    ]
     np.testing.assert_allclose(faces, expected)
 
 
@@ -383,7 +523,12 @@ def test_ant_pushes_the_block():
     for _ in range(40):
         env.data.qvel[1] = 2
         obs = env.step(np.zeros(8))[0]
-    assert obs[4] > 8.3 and obs[4] == pytest.approx(8 + env.data.qpos[16]) and abs(obs[3]) < 1 and obs[5] == 2
+    assert (
+        obs[4] > 8.3
+        and obs[4] == pytest.approx(8 + env.data.qpos[16])
+        and abs(obs[3]) < 1
+        and obs[5] == 2
+    )
     assert obs[4] - obs[1] > 4  # it has not gone into the block
 
 

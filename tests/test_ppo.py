@@ -1,7 +1,5 @@
 """The algorithm against Stable-Baselines3: same weights and data in, same numbers out."""
 
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import ppo_colored_continuous as ppo
+import run_files
 from colored_noise import ColoredNoiseProcess
 from environments import make_vector_env
 
@@ -20,7 +19,7 @@ N_STEPS, N_ENVS = 64, 3
 
 
 class Drift(gym.Env):
-    """A point pushed by two actions. Its episode ends where it has gone far, and its time limit is 20 steps."""
+    """A point pushed by two actions; an episode ends far away, or at a time limit of 20 steps."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = gym.spaces.Box(np.array([-1, -0.5], np.float32), np.array([1, 0.5], np.float32))
@@ -32,7 +31,13 @@ class Drift(gym.Env):
     def step(self, action):
         assert self.action_space.contains(action)  # actions arrive clipped
         self.x, self.t = self.x + action, self.t + 1
-        return self._obs(), float(self.x.sum() + 0.1 * self.t), bool(abs(self.x).max() > 3), False, {}
+        return (
+            self._obs(),
+            float(self.x.sum() + 0.1 * self.t),
+            bool(abs(self.x).max() > 3),
+            False,
+            {},
+        )
 
     def _obs(self):
         return np.array([*self.x, 0.1 * self.t], np.float32)
@@ -42,18 +47,23 @@ gym.register("Drift-v0", Drift, max_episode_steps=20)
 
 
 def parse(flags=""):
-    sys.argv = ["ppo_colored_continuous.py", *flags.split()]
-    return ppo.parse_args()
+    return ppo.parse_args(flags.split())
 
 
 def layers(agent):
-    return {f"{net}.{i}": getattr(agent, net)[i] for net in ("actor_mean", "critic") for i in (0, 2, 4)}
+    return {
+        f"{net}.{i}": getattr(agent, net)[i] for net in ("actor_mean", "critic") for i in (0, 2, 4)
+    }
 
 
 def sb3_layers(policy):
     actor, critic = policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net
     return dict(
-        zip(layers(ppo.Agent(1, 1)), [*actor[::2], policy.action_net, *critic[::2], policy.value_net], strict=True)
+        zip(
+            layers(ppo.Agent(1, 1)),
+            [*actor[::2], policy.action_net, *critic[::2], policy.value_net],
+            strict=True,
+        )
     )
 
 
@@ -66,10 +76,17 @@ def copy_weights(agent, policy):
 
 
 def make_pair(flags="", **sb3_settings):
-    """Our agent and SB3's PPO with the same random weights (far from the initial ones), and our arguments."""
+    """Our agent and SB3's PPO with the same random weights, not the initial ones; our arguments."""
     args = parse(flags)
-    settings = dict(learning_rate=args.learning_rate, n_steps=N_STEPS, batch_size=N_STEPS * N_ENVS, n_epochs=1)
-    sb3 = PPO("MlpPolicy", DummyVecEnv([lambda: gym.make("Drift-v0")] * N_ENVS), **{**settings, **sb3_settings}, seed=1)
+    settings = dict(
+        learning_rate=args.learning_rate, n_steps=N_STEPS, batch_size=N_STEPS * N_ENVS, n_epochs=1
+    )
+    sb3 = PPO(
+        "MlpPolicy",
+        DummyVecEnv([lambda: gym.make("Drift-v0")] * N_ENVS),
+        **{**settings, **sb3_settings},
+        seed=1,
+    )
     torch.manual_seed(0)
     agent = ppo.Agent(3, 2).requires_grad_(False)
     for p in agent.parameters():
@@ -81,17 +98,23 @@ def make_pair(flags="", **sb3_settings):
 def random_minibatch(agent, n=N_STEPS * N_ENVS):
     torch.manual_seed(2)
     obs, actions = torch.randn(n, 3), torch.randn(n, 2)
-    logprobs = agent(obs, actions)[0] + 0.3 * torch.randn(n)  # so that a good part of the ratios is clipped
-    return obs, actions, logprobs, 2 * torch.randn(n) + 1, 3 * torch.randn(n)
+    logprobs = agent(obs, actions)[0] + 0.3 * torch.randn(
+        n
+    )  # so that a good part of the ratios is clipped
+    return obs, actions, logprobs, 2 * torch.randn(n) + 1, 3 * torch.randn(n), torch.randn(n)
 
 
 def fill_buffer(sb3, minibatch):
     """Puts a minibatch into SB3's rollout buffer in the same order, flattened already."""
     buffer = sb3.rollout_buffer
     buffer.reset()
-    obs, actions, logprobs, advantages, returns = (x.numpy() for x in minibatch)
+    obs, actions, logprobs, advantages, returns, _ = (x.numpy() for x in minibatch)
     buffer.observations, buffer.actions = obs, actions
-    buffer.log_probs, buffer.advantages, buffer.returns = logprobs[:, None], advantages[:, None], returns[:, None]
+    buffer.log_probs, buffer.advantages, buffer.returns = (
+        logprobs[:, None],
+        advantages[:, None],
+        returns[:, None],
+    )
     buffer.values = np.zeros_like(buffer.returns)
     buffer.full = buffer.generator_ready = True
     sb3._setup_learn(1)
@@ -99,14 +122,21 @@ def fill_buffer(sb3, minibatch):
 
 def flat(agent, policy, get=lambda p: p):
     """SB3's parameters, or get(parameter) of each, in the order of our flat vector."""
-    pairs = {f"{name}.{k}": p for name, layer in sb3_layers(policy).items() for k, p in layer.named_parameters()}
+    pairs = {
+        f"{name}.{k}": p
+        for name, layer in sb3_layers(policy).items()
+        for k, p in layer.named_parameters()
+    }
     pairs["log_std"] = policy.log_std
-    return torch.cat([get(pairs[name]).detach().reshape(-1) for name, _ in agent.named_parameters()])
+    return torch.cat(
+        [get(pairs[name]).detach().reshape(-1) for name, _ in agent.named_parameters()]
+    )
 
 
-def initial_optimizer(agent):
+def initial_state(agent):
     params = torch.nn.utils.parameters_to_vector(agent.parameters()).clone()
-    return params, torch.zeros_like(params), torch.zeros_like(params), torch.zeros((), dtype=torch.float64)
+    step = torch.zeros((), dtype=torch.float64)
+    return params, (torch.zeros_like(params), torch.zeros_like(params), step)
 
 
 def test_network_is_the_same():
@@ -127,7 +157,9 @@ def test_initial_weights_have_the_same_law():
     agent, sb3 = ppo.Agent(3, 2), PPO("MlpPolicy", gym.make("Drift-v0"), seed=1).policy
     for name, theirs in sb3_layers(sb3).items():
         ours = layers(agent)[name]
-        torch.testing.assert_close(torch.linalg.svdvals(ours.weight), torch.linalg.svdvals(theirs.weight))
+        torch.testing.assert_close(
+            torch.linalg.svdvals(ours.weight), torch.linalg.svdvals(theirs.weight)
+        )
         assert ours.weight.shape == theirs.weight.shape and not ours.bias.any()
     assert torch.equal(agent.log_std, sb3.log_std)
 
@@ -144,53 +176,59 @@ def test_initial_weights_have_the_same_law():
 def test_loss_and_gradient(flags, settings):
     agent, sb3, args = make_pair(flags, **settings)
     minibatch = random_minibatch(agent)
-    params = initial_optimizer(agent)[0]
-    grads, (policy_loss, value_loss, entropy, kl, clip_fraction) = torch.func.grad(ppo.ppo_loss, has_aux=True)(
-        params, minibatch, agent, args
-    )
+    params, _ = initial_state(agent)
+    loss_and_metrics = torch.func.grad(ppo.ppo_loss, has_aux=True)
+    grads, metrics = loss_and_metrics(params, minibatch, agent, args)
     loss, _ = ppo.ppo_loss(params, minibatch, agent, args)
 
     fill_buffer(sb3, minibatch)
     sb3.train()
     logged = sb3.logger.name_to_value
     assert loss.item() == pytest.approx(logged["train/loss"], rel=1e-4)
-    assert policy_loss.item() == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
-    assert value_loss.item() == pytest.approx(logged["train/value_loss"], rel=1e-5)
-    assert -entropy.item() == pytest.approx(logged["train/entropy_loss"], rel=1e-5)
-    assert kl.item() == pytest.approx(logged["train/approx_kl"], rel=1e-4)
-    assert clip_fraction.item() == pytest.approx(logged["train/clip_fraction"]) and 0.2 < clip_fraction < 0.8
+    ours = {name: value.item() for name, value in metrics.items()}
+    assert ours["policy_loss"] == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
+    assert ours["value_loss"] == pytest.approx(logged["train/value_loss"], rel=1e-5)
+    assert -ours["entropy"] == pytest.approx(logged["train/entropy_loss"], rel=1e-5)
+    assert ours["approx_kl"] == pytest.approx(logged["train/approx_kl"], rel=1e-4)
+    assert ours["clip_fraction"] == pytest.approx(logged["train/clip_fraction"])
+    assert 0.2 < ours["clip_fraction"] < 0.8
 
     grads = grads * min(1, args.max_grad_norm / (grads.norm().item() + 1e-6))
     theirs = flat(agent, sb3.policy, lambda p: p.grad)
     torch.testing.assert_close(grads, theirs, rtol=1e-3, atol=1e-6)
 
 
-def test_parameters_after_clipped_adam_steps():
-    agent, sb3, args = make_pair("--learning-rate 1e-3", n_epochs=5)
-    minibatch, optimizer = random_minibatch(agent), initial_optimizer(agent)
-    fill_buffer(sb3, minibatch)
+@pytest.mark.parametrize("rates", [[1e-3] * 5, [1e-3, 8e-4, 5e-4, 2e-4, 1e-4]])
+def test_parameters_after_clipped_adam_steps(rates):
+    agent, sb3, args = make_pair("", n_epochs=1)
+    minibatch, (params, optimizer) = random_minibatch(agent), initial_state(agent)
     before = flat(agent, sb3.policy)
-    torch.testing.assert_close(optimizer[0], before)
-    sb3.train()
-    update = ppo.make_update(agent, args)
-    for _ in range(5):
-        optimizer, _ = update(optimizer, minibatch)
+    torch.testing.assert_close(params, before)
+    for rate in rates:
+        fill_buffer(sb3, minibatch)
+        sb3.lr_schedule = lambda _, rate=rate: rate
+        sb3.train()
+        rate = torch.tensor(rate, dtype=torch.float64)
+        params, optimizer, _ = ppo.ppo_update(params, optimizer, minibatch, rate, agent, args)
     after = flat(agent, sb3.policy)
-    assert (after - before).abs().max() > 3e-3
-    torch.testing.assert_close(optimizer[0], after, rtol=1e-4, atol=2e-5)
+    assert (after - before).abs().max() > 2e-3
+    torch.testing.assert_close(params, after, rtol=1e-4, atol=2e-5)
 
 
-@pytest.mark.parametrize("flags", ["", "--learning-rate 3e-3 --ent-coef 0.1"])  # the second is compiled anew
-def test_compiled_update_equals_eager(flags):
+def test_compiled_update_equals_eager():
+    """Also where what was compiled first meets other sizes, rates, arguments and another agent."""
     agent, _, _ = make_pair()
-    args = parse(flags)
-    minibatch, compiled, eager = random_minibatch(agent), initial_optimizer(agent), initial_optimizer(agent)
-    update = ppo.make_update(agent, args)
-    compiled_update = ppo.compile_update(update, (compiled, minibatch))
-    assert compiled_update is not update
-    for n in (N_STEPS * N_ENVS, N_STEPS * N_ENVS, 7, N_STEPS * N_ENVS):  # a last minibatch can be smaller
-        compiled, metrics = compiled_update(compiled, tuple(x[:n] for x in minibatch))
-        eager, eager_metrics = update(eager, tuple(x[:n] for x in minibatch))
+    minibatch, compiled, eager = random_minibatch(agent), initial_state(agent), initial_state(agent)
+    update = run_files.compiled(ppo.ppo_update)
+    all_args = [parse(), parse("--ent-coef 0.1 --max-grad-norm 0.2")]
+    for n, rate, args in [(192, 1e-3, 0), (192, 2e-3, 0), (7, 1e-3, 0), (192, 1e-3, 1)]:
+        rate, args = torch.tensor(rate, dtype=torch.float64), all_args[args]
+        rest = (tuple(x[:n] for x in minibatch), rate, agent, args)
+        *compiled, metrics = update(*compiled, *rest)
+        *eager, eager_metrics = ppo.ppo_update(*eager, *rest)
+    assert "functions" in update.__code__.co_freevars  # that it did compile:
+    (functions,) = [c.cell_contents for c in update.__closure__ if type(c.cell_contents) is list]
+    assert functions[0] is not ppo.ppo_update
     torch.testing.assert_close(compiled[0], eager[0], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(metrics, eager_metrics, rtol=1e-3, atol=1e-5)
 
@@ -224,48 +262,62 @@ class ColoredGaussian(DiagGaussianDistribution):
 
 @pytest.mark.parametrize("bootstrap", ["", "--no-bootstrap-timeouts"])
 def test_whole_rollout_against_sb3(monkeypatch, tmp_path, bootstrap):
-    """The script's first batch, with colored noise, clipped actions, ends of episodes and time limits, is SB3's.
+    """The script's batches, with colored noise, clipped actions, ends, time limits, are SB3's.
 
     Three rollouts with the policy unchanged, so that noise and episodes run on across rollouts.
     """
-    flags = f"--env-id Drift-v0 --n-steps {N_STEPS} --n-envs {N_ENVS} --batch-size {N_STEPS * N_ENVS} --n-epochs 1"
-    flags += (
-        f" --total-timesteps {3 * N_STEPS * N_ENVS} --eval-freq {3 * N_STEPS * N_ENVS} --no-compile --noise-seq-len 50"
+    size, total = N_STEPS * N_ENVS, 3 * N_STEPS * N_ENVS
+    flags = f"--env-id Drift-v0 --n-steps {N_STEPS} --n-envs {N_ENVS} --total-timesteps {total} "
+    flags += f"--batch-size {size} --n-epochs 1 --eval-freq {total} --eval-episodes 1 --no-compile "
+    args = parse(f"{flags} --noise-seq-len 50 --runs-dir {tmp_path} {bootstrap}")
+    agents, batches = [], []
+
+    def make_agent(*dims):
+        agents.append(ppo.Agent(*dims))
+        agents[0].critic[-1].bias.data += 5  # a value worth bootstrapping
+        return agents[0]
+
+    def learn(agent, optimizer, batch, *_):
+        batches.append([x.clone() for x in batch])
+        return optimizer, {}
+
+    ppo.main(args, make_agent=make_agent, learn=learn)
+    agent = agents[0]
+
+    sb3 = PPO(
+        "MlpPolicy", DummyVecEnv([lambda: gym.make("Drift-v0")] * N_ENVS), n_steps=N_STEPS, seed=1
     )
-    batches = []
-
-    def make_update(agent, args):
-        agent.critic[-1].bias += 5  # a value worth bootstrapping
-        batches.append(agent)
-        return lambda optimizer, minibatch: (batches.append(minibatch), (optimizer, torch.zeros(5)))[1]
-
-    monkeypatch.setattr(ppo, "make_update", make_update)
-    monkeypatch.setattr(torch, "randperm", torch.arange)
-    monkeypatch.setattr(sys, "argv", ["x", *f"{flags} --eval-episodes 1 --runs-dir {tmp_path} {bootstrap}".split()])
-    ppo.main()
-    agent, *batches = batches
-
-    sb3 = PPO("MlpPolicy", DummyVecEnv([lambda: gym.make("Drift-v0")] * N_ENVS), n_steps=N_STEPS, seed=1)
     copy_weights(agent, sb3.policy)
-    sb3.policy.action_dist = ColoredGaussian(ColoredNoiseProcess(0.5, N_ENVS, 2, 50, ppo.make_seeds(2, 1, 0)[1]))
+    sb3.policy.action_dist = ColoredGaussian(
+        ColoredNoiseProcess(0.5, N_ENVS, 2, 50, run_files.make_seeds(2, 1, 0)[1])
+    )
     if bootstrap:  # the paper's dm_control runs did not see that an end was a time limit
         step_wait = sb3.env.step_wait
-        strip = lambda r: (*r[:3], [{k: v for k, v in i.items() if k != "TimeLimit.truncated"} for i in r[3]])  # noqa: E731
-        monkeypatch.setattr(sb3.env, "step_wait", lambda: strip(step_wait()))
+
+        def without_time_limits():
+            *rest, infos = step_wait()
+            for info in infos:
+                info.pop("TimeLimit.truncated", None)
+            return *rest, infos
+
+        monkeypatch.setattr(sb3.env, "step_wait", without_time_limits)
     _, callback = sb3._setup_learn(10**6)
-    for obs, actions, logprobs, advantages, returns in batches:
+    for batch in batches:
         sb3.collect_rollouts(sb3.env, callback, sb3.rollout_buffer, N_STEPS)
         buffer = sb3.rollout_buffer
         assert buffer.episode_starts.sum() > N_ENVS
-        assert {x.dtype for x in (obs, actions, logprobs, advantages, returns)} == {torch.float32}  # as compiled
-        for ours, their in [(obs, buffer.observations), (actions, buffer.actions), (logprobs, buffer.log_probs),
-                            (advantages, buffer.advantages), (returns, buffer.returns)]:  # fmt: skip
-            np.testing.assert_allclose(ours.numpy(), their.reshape(ours.shape), rtol=1e-3, atol=1e-4)
+        assert {x.dtype for x in batch} == {torch.float32}  # or it would be compiled anew
+        theirs = (buffer.observations, buffer.actions, buffer.log_probs, buffer.advantages)
+        theirs += (buffer.returns, buffer.values)
+        for ours, their in zip(batch, theirs, strict=True):
+            np.testing.assert_allclose(
+                ours.numpy(), their.reshape(ours.shape), rtol=1e-3, atol=1e-4
+            )
     assert len(batches) == 3
 
 
 class Count(gym.Env):
-    """Counts its steps: observation t, reward t. It terminates after as many steps as its seed says, 5 by default."""
+    """Observation and reward are the time t. Terminates after `seed` steps, 5 by default."""
 
     observation_space = gym.spaces.Box(0, 10, (1,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)

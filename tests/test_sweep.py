@@ -55,7 +55,9 @@ class Tiny:
         self.runs, self.steps = runs, steps
         self.args = ["quick", "--seeds", seeds, "--betas", betas, "--runs-dir", str(runs)]
         self.folders = [
-            runs / MOUNTAIN_CAR / f"beta_{b}/n_envs_4/seed_{s}" for s in seeds.split() for b in betas.split()
+            runs / MOUNTAIN_CAR / f"beta_{b}/n_envs_4/seed_{s}"
+            for s in seeds.split()
+            for b in betas.split()
         ]
 
     def run(self, *args):
@@ -65,7 +67,12 @@ class Tiny:
         command = [SWEEP, *self.args, *args, "--", *TINY, str(self.steps)]
         pipe = subprocess.PIPE
         process = subprocess.Popen(
-            command, stdout=pipe, stderr=subprocess.STDOUT, text=True, env=ENV, start_new_session=True
+            command,
+            stdout=pipe,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=ENV,
+            start_new_session=True,
         )
         started.append(process)
         return process
@@ -114,7 +121,13 @@ def children(pid):
 
 @pytest.mark.parametrize(
     ("preset", "runs", "envs"),
-    [("quick", 4, 1), ("main", 20480, 16), ("vanilla", 2560, 16), ("n_steps", 960, 16), ("n_epochs", 2880, 16)]
+    [
+        ("quick", 4, 1),
+        ("main", 20480, 16),
+        ("vanilla", 2560, 16),
+        ("n_steps", 960, 16),
+        ("n_epochs", 2880, 16),
+    ]
     + [("complex", 640, 4)],
 )
 def test_preset_counts(preset, runs, envs):
@@ -125,7 +138,10 @@ def test_preset_counts(preset, runs, envs):
     assert len({w[w.index("--env-id") + 1] for w in words}) == envs
     # No two runs share a folder
     flags = ["--env-id", "--beta", "--n-envs", "--seed", "--exp-name"]
-    assert len({tuple(w[w.index(f) + 1] if f in w else "vanilla" for f in flags) for w in words}) == runs
+    assert (
+        len({tuple(w[w.index(f) + 1] if f in w else "vanilla" for f in flags) for w in words})
+        == runs
+    )
     assert all("--resume" in w for w in words)
 
 
@@ -151,15 +167,45 @@ def test_narrowing_and_quoting():
         for beta in ["0", "0.5", "-1"]
     ]
     assert [tuple(w[3:10:2]) for w in words] == expected
-    tail = ["--exp-name", "x", "--runs-dir", "my runs/a", "--resume", "--note", "it's $HOME; a b", "--no-compile"]
+    tail = [
+        "--exp-name",
+        "x",
+        "--runs-dir",
+        "my runs/a",
+        "--resume",
+        "--note",
+        "it's $HOME; a b",
+        "--no-compile",
+    ]
     assert all(w[10:] == tail for w in words)
 
 
 @pytest.mark.parametrize(
     "args",
-    ["", "mane", "main --foo", "main --envs PontUMaze-v1", "main --betas 0,5", "main --betas", "main --seeds -1"]
-    + ["main --n-envs 0", "main --n-envs 1.5", "main -j 0", "main -j", "vanilla --betas 0", "main --n-epochs 5"]
-    + ["main --print --slurm", "main --exp-name a/b", "main --runs-per-task x", "n_steps --n-envs 3", "main 4"]
+    [
+        "",
+        "mane",
+        "main --foo",
+        "main --envs PontUMaze-v1",
+        "main --betas 0,5",
+        "main --betas",
+        "main --seeds -1",
+    ]
+    + [
+        "main --n-envs 0",
+        "main --n-envs 1.5",
+        "main -j 0",
+        "main -j",
+        "vanilla --betas 0",
+        "main --n-epochs 5",
+    ]
+    + [
+        "main --print --slurm",
+        "main --exp-name a/b",
+        "main --runs-per-task x",
+        "n_steps --n-envs 3",
+        "main 4",
+    ]
     + ["main -- --seed 3", "main -- --overwrite", "n_steps -- --n-steps=5"],
 )
 def test_wrong_usage_is_one_line(args):
@@ -177,17 +223,24 @@ def test_status_counts_and_time_left(tmp_path):
         (folder / "lock").touch()
     (failed / "failed").write_text("1\n")
     assert (
-        tiny.status() == "quick: 0 of 4 done, 0 running, 1 failed, 3 to do, time left: known when the first run is done"
+        tiny.status()
+        == "quick: 0 of 4 done, 0 running, 1 failed, 3 to do, time left: known when the first run is done"
     )
     (done / "summary.json").write_text(json.dumps({"steps": 8, "wall_seconds": 5400.0}, indent=2))
-    assert tiny.status().endswith("1 failed, 2 to do, nothing is running, work left: 3.0 h of one core")
+    assert tiny.status().endswith(
+        "1 failed, 2 to do, nothing is running, work left: 3.0 h of one core"
+    )
     (running / "config.json").write_text(json.dumps({"args": {"total_timesteps": 1000, "seed": 1}}))
-    (running / "evaluations.csv").write_text("step,return_mean,return_std,length_mean\n100,1,0,9\n600,1,0,9\n")
+    (running / "evaluations.csv").write_text(
+        "step,return_mean,return_std,length_mean\n100,1,0,9\n600,1,0,9\n"
+    )
     with open(running / "lock", "a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         head, _, row = sweep(*tiny.args, "--status").stdout.splitlines()
     # 0.4 runs are left of the running one, 1 of the other, at 1.5 h each
-    assert head == "quick: 1 of 4 done, 1 running, 1 failed, 1 to do, 2.1 h left at the present rate"
+    assert (
+        head == "quick: 1 of 4 done, 1 running, 1 failed, 1 to do, 2.1 h left at the present rate"
+    )
     assert row.split() == ["MountainCarContinuous-v0", "1", "1", "1", "1", "1.5", "h", "2.1", "h"]
 
 
@@ -202,7 +255,9 @@ def test_complete_then_nothing_to_do(tmp_path):
     assert tiny.status() == "quick: 2 of 2 done, 0 running, 0 failed, 0 to do"
     before = {path: path.stat().st_mtime_ns for path in tiny.runs.rglob("*") if path.is_file()}
     assert tiny.run("-j", "2").returncode == 0
-    assert {path: path.stat().st_mtime_ns for path in tiny.runs.rglob("*") if path.is_file()} == before
+    assert {
+        path: path.stat().st_mtime_ns for path in tiny.runs.rglob("*") if path.is_file()
+    } == before
     # A printed command is a whole command
     command = sweep(*tiny.args, "--print", "--", *TINY, "1024").stdout.splitlines()[0]
     result = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True)
@@ -218,7 +273,11 @@ def test_failed_run_does_not_stop_the_others(tmp_path):
         result = tiny.run("-j", "1")
         assert result.returncode == 1
         assert (good / "summary.json").exists()
-        line = next(line for line in result.stdout.splitlines() if line.startswith("failed with exit code 1: "))
+        line = next(
+            line
+            for line in result.stdout.splitlines()
+            if line.startswith("failed with exit code 1: ")
+        )
         assert str(bad) in line and "config.json is damaged" in line
         assert starts(bad) == 1, attempt
     assert tiny.status() == "quick: 1 of 2 done, 0 running, 1 failed, 0 to do"
@@ -254,7 +313,9 @@ def test_two_sweeps_share_the_work(tmp_path):
     assert all("\ncomplete (" in output for output in outputs)  # each did a share
 
 
-@pytest.mark.parametrize("to, number", [("all", signal.SIGINT), ("runs", signal.SIGINT), ("sweep", signal.SIGTERM)])
+@pytest.mark.parametrize(
+    "to, number", [("all", signal.SIGINT), ("runs", signal.SIGINT), ("sweep", signal.SIGTERM)]
+)
 def test_stopped_sweep_saves_and_tells_how_to_go_on(tmp_path, to, number):
     tiny = Tiny(tmp_path / "runs", betas="0 0.5", steps=2_048_000)
     process = tiny.start("-j", "2")
@@ -312,7 +373,9 @@ def test_missing_folder(tmp_path):
 def test_full_disk(tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True).returncode:
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True
+    ).returncode:
         pytest.skip("only root can mount a small disk")
     try:
         tiny = Tiny(disk / "runs")
@@ -351,7 +414,9 @@ def submit(tiny, *args):
 
 
 def queued(*jobs):
-    return subprocess.run(["squeue", "-h", "-j", ",".join(jobs)], capture_output=True, text=True).stdout.strip()
+    return subprocess.run(
+        ["squeue", "-h", "-j", ",".join(jobs)], capture_output=True, text=True
+    ).stdout.strip()
 
 
 def test_slurm_arrays_complete(slurm, tmp_path):
@@ -377,7 +442,9 @@ def test_slurm_requeue_and_scancel(slurm, tmp_path):
     subprocess.run(["scancel", f"{job}_1"], check=True)
     wait_for(lambda: not queued(job), 300)
     assert (requeued / "summary.json").exists() and starts(requeued) == 2
-    assert (requeued / "config.json").stat().st_mtime_ns == config  # it went on and did not start again
+    assert (
+        requeued / "config.json"
+    ).stat().st_mtime_ns == config  # it went on and did not start again
     assert tiny.status().startswith("quick: 1 of 2 done, 0 running, 0 failed, 1 to do")
     assert evaluations(cancelled)
     assert tiny.run("-j", "1").returncode == 0

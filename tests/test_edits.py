@@ -1,0 +1,209 @@
+"""Edits that students make, each in a copy of the script: they take effect, or fail with a message.
+
+An edit is a list of (old line, new line). The copy is run; the tests look at what it left behind.
+"""
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+import torch
+from conftest import SCRIPT
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import run_files
+from environments import make_vector_env
+
+FLAGS = "--env-id Pendulum-v1 --total-timesteps 2048 --n-envs 2 --n-steps 256 --eval-freq 1024 "
+FLAGS += "--eval-episodes 2 --n-epochs 1 --learning-rate 1e-2 --overwrite"
+
+
+def edit(tmp_path, *edits):
+    """The script with the edits, as a module."""
+    text = SCRIPT.read_text()
+    for old, new in edits:
+        assert old in text, f"the script has no longer: {old}"
+        text = text.replace(old, new)
+    path = tmp_path / "edited.py"
+    path.write_text(text)
+    spec = importlib.util.spec_from_file_location("edited", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["edited"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(module, tmp_path, flags="--no-compile", **kwargs):
+    """Runs it; returns the final agent, its evaluated final return, and TensorBoard's points."""
+    args = module.parse_args(f"{FLAGS} --runs-dir {tmp_path / 'runs'} {flags}".split())
+    module.main(args, **kwargs)
+    folder = run_files.run_path(vars(args))
+    checkpoint = torch.load(folder / "checkpoint.pt", weights_only=True)
+    agent = module.Agent(3, 1).requires_grad_(False)
+    agent.load_state_dict(checkpoint["agent"])
+    events = EventAccumulator(str(folder)).Reload()
+    scalars = {tag: [e.value for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    return agent, scalars["evaluation/return_mean"][-1], scalars
+
+
+def parameters(agent):
+    return torch.nn.utils.parameters_to_vector(agent.parameters())
+
+
+@pytest.fixture
+def original(tmp_path):
+    return run(edit(tmp_path), tmp_path)
+
+
+RATE = "learning_rate = args.learning_rate * (1 - global_step / total if args.anneal_lr else 1)"
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_annealing_by_hand(tmp_path, flags):
+    """A learning rate set in the loop is used, compiled or not, and is what --anneal-lr does."""
+    module = edit(
+        tmp_path, (RATE, "learning_rate = args.learning_rate * (1 - global_step / total)")
+    )
+    by_hand, _, scalars = run(module, tmp_path, flags)
+    constant, *_ = run(edit(tmp_path), tmp_path, flags)
+    flag, *_ = run(edit(tmp_path), tmp_path, f"{flags} --anneal-lr")
+    assert torch.equal(parameters(by_hand), parameters(flag))
+    assert (parameters(by_hand) - parameters(constant)).abs().max() > 1e-3
+    np.testing.assert_allclose(scalars["losses/learning_rate"], [1e-2, 7.5e-3, 5e-3, 2.5e-3])
+
+
+def test_arguments_are_read_only(tmp_path):
+    module = edit(tmp_path, (RATE, f"args.learning_rate *= 0.5\n            {RATE}"))
+    with pytest.raises(AttributeError, match="args.learning_rate is read-only.*handed on"):
+        run(module, tmp_path)
+
+
+HIDDEN = "*(layer_init(nn.Linear(64, 64)), nn.Tanh()),"
+
+
+@pytest.mark.parametrize(
+    "edits, in_numpy",
+    [
+        ([("nn.Tanh()", "nn.ReLU()")], True),
+        ([(HIDDEN, f"{HIDDEN}\n                {HIDDEN}")], True),
+        ([(HIDDEN, f"nn.LayerNorm(64), {HIDDEN}")], False),
+        ([("nn.Tanh()", "nn.GELU()")], False),
+    ],
+    ids=["ReLU", "third hidden layer", "LayerNorm", "GELU"],
+)  # fmt: skip
+def test_layers(tmp_path, original, edits, in_numpy):
+    """What is evaluated and acts is the module that learns."""
+    module = edit(tmp_path, *edits)
+    agent, final_return, _ = run(module, tmp_path)
+    obs = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    policy = run_files.numpy_policy(agent.actor_mean)
+    torch.testing.assert_close(
+        torch.tensor(policy(obs)), agent.actor_mean(torch.tensor(obs)), rtol=1e-5, atol=1e-6
+    )
+    assert (policy.__name__ == "policy") == in_numpy
+
+    def mean_action(obs):
+        return agent.actor_mean(torch.tensor(obs)).numpy()
+
+    envs = make_vector_env("Pendulum-v1", 2)
+    returns, _ = module.evaluate(mean_action, envs, run_files.make_seeds(2, 1, 2, 2048))
+    assert returns.mean() == pytest.approx(final_return, rel=1e-3)
+    assert final_return != pytest.approx(original[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_log_the_gradient_norm(tmp_path, flags):
+    line = "    params, optimizer = adam(params, grads, optimizer, learning_rate)"
+    module = edit(tmp_path, (line, '    metrics["grad_norm"] = grads.norm()\n' + line))
+    _, _, scalars = run(module, tmp_path, flags)
+    norms = scalars["losses/grad_norm"]  # after clipping at 0.5
+    assert len(norms) == 4 and all(0 < norm <= 0.5001 for norm in norms)
+
+
+AR1 = """def ar1(shape):
+    eps = torch.randn(shape)
+    for t in range(1, len(eps)):
+        eps[t] = 0.9 * eps[t - 1] + (1 - 0.9**2) ** 0.5 * eps[t]
+    return eps
+
+
+def exploration("""
+
+
+def test_another_noise(tmp_path):
+    """AR(1), the discrete Ornstein-Uhlenbeck process, in place of 1/f noise."""
+    module = edit(tmp_path, ("noise.sample(args.n_steps)", "ar1(shape)"), ("def exploration(", AR1))
+    batches = []
+
+    def learn(agent, optimizer, batch, *_):
+        batches.append(batch[1].view(256, 2).clone())
+        return optimizer, {}
+
+    run(module, tmp_path, learn=learn)
+    actions = torch.cat(batches)
+    correlation = torch.corrcoef(torch.stack([actions[:-1, 0], actions[1:, 0]]))[0, 1]
+    assert correlation.item() == pytest.approx(0.9, abs=0.05)
+
+
+NORMALIZE = """class NormalizeObservations(gym.vector.VectorWrapper):
+    mean, var, n = 0, 1, 1e-4
+
+    def normalize(self, obs):
+        rate = len(obs) / (self.n + len(obs))
+        self.n += len(obs)
+        change = obs.mean(0) - self.mean
+        self.var = (1 - rate) * (self.var + rate * change**2) + rate * obs.var(0)
+        self.mean = self.mean + rate * change
+        return ((obs - self.mean) / np.sqrt(self.var + 1e-8)).clip(-10, 10).astype(np.float32)
+
+    def reset(self, **kwargs):
+        obs, infos = self.env.reset(**kwargs)
+        return self.normalize(obs), infos
+
+    def step(self, actions):
+        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        return self.normalize(obs), rewards, terminated, truncated, infos
+
+
+def main("""
+
+
+def test_normalize_observations_by_a_wrapper(tmp_path):
+    """Written out, since Gymnasium's own for vector environments refuse SAME_STEP autoreset."""
+    make = "make_vector_env(args.env_id, args.n_envs, *how)"
+    module = edit(tmp_path, (make, f"NormalizeObservations({make})"), ("def main(", NORMALIZE))
+    observations = []
+
+    def learn(agent, optimizer, batch, *_):
+        observations.append(batch[0].clone())
+        return optimizer, {}
+
+    run(module, tmp_path, learn=learn)
+    std = torch.cat(observations)[256:].std(0)  # of the angular velocity it would be about 2
+    assert ((std > 0.7) & (std < 1.3)).all()
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_print_in_the_loss(tmp_path, capsys, flags):
+    line = "    ratio = log_ratio.exp()"
+    module = edit(tmp_path, (line, f'{line}\n    print("ratio", ratio.mean())'))
+    run(module, tmp_path, flags)
+    out, err = capsys.readouterr()
+    assert out.count("ratio") >= 16  # 4 updates of 4 minibatches
+    assert ("going on without torch.compile" in err) == (flags == "")
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_a_mistake_in_the_loss_is_a_traceback(tmp_path, flags):
+    module = edit(tmp_path, ("    ratio = log_ratio.exp()", "    ratio = log_ratio.expp()"))
+    with pytest.raises(AttributeError, match="expp"):
+        run(module, tmp_path, flags)
+
+
+def test_the_module_is_what_counts(tmp_path):
+    """What the loop does to the agent's parameters is what the next update starts from."""
+    line = "            optimizer, metrics = learn("
+    freeze = "            agent.log_std.data = torch.full((1,), -2.0)\n"
+    agent, *_ = run(edit(tmp_path, (line, freeze + line)), tmp_path, "--no-compile --n-epochs 1")
+    assert agent.log_std.item() == pytest.approx(-2, abs=0.1)  # one update away
