@@ -153,6 +153,8 @@ def read_folder(path):
     progress = tqdm(folders, desc=f"reading {path}", unit=" runs", mininterval=0.5)
     read = [read_run(folder) for folder in progress]
     runs = pd.DataFrame([run for run, _, _ in read])
+    seeds = [run.get("seed", np.nan) for run, _, _ in read]
+    runs["seed"] = pd.Series(seeds, dtype=object)  # where one is missing, large ones stay exact
     runs["path"] = [folder.relative_to(path).as_posix() for folder in folders]
     all_steps = np.unique(np.concatenate([np.zeros(0, int), *(steps for _, steps, _ in read)]))
     curves = np.full((len(read), len(all_steps)), np.nan)
@@ -167,17 +169,23 @@ def read_packed(path):
         data = file.read()
     try:
         data = gzip.decompress(data) if path.suffix == ".gz" else data
-        text = dict.fromkeys(("beta", "env_id", "status", "path"), str)
+        text = dict.fromkeys(("seed", "beta", "env_id", "status", "path"), str)
         runs = pd.read_csv(io.BytesIO(data), dtype=text, index_col=False, low_memory=False)
         columns = [column for column in runs if column.isdecimal()]
-        settings = runs[[*WHOLE, "total_timesteps", "eval_freq", *text]]
+        numbers = runs[[*WHOLE, "total_timesteps", "eval_freq"]]
+        runs[[*text]]
     except Exception as error:  # pandas and gzip raise nearly anything on what is not theirs
         reason = f"not a file that `analysis.py pack` wrote, or damaged: {error}"
         raise Unusable(f"{path} is {reason}") from None
     curves = runs[columns].apply(pd.to_numeric, errors="coerce").rename(columns=int)
     runs = runs.drop(columns=columns)
-    numbers = settings.drop(columns=list(text)).apply(pd.to_numeric, errors="coerce")
+    numbers = numbers.apply(pd.to_numeric, errors="coerce")
+    seeds = [
+        int(text) if str(text).isdecimal() else number
+        for text, number in zip(runs.seed, numbers.seed, strict=True)
+    ]
     runs[WHOLE] = numbers[WHOLE]
+    runs["seed"] = pd.Series(seeds, runs.index, object)
 
     found, expected = np.isfinite(curves).sum(axis=1), numbers.total_timesteps // numbers.eval_freq
     lines = [f"{n} of {m:g} evaluations" for n, m in zip(found, expected, strict=True)]
@@ -265,7 +273,6 @@ def pack(runs, curves, file, inputs=(), overwrite=False):
     derived = ["source", "environment", "performance", "final_return"]
     derived += ["runs_dir", "resume", "overwrite"]
     table = runs.drop(columns=derived, errors="ignore").dropna(axis=1, how="all")
-    table = table.astype(dict.fromkeys(set(WHOLE) & set(table), "Int64"))  # or a gap makes floats
     text = pd.concat([table, curves], axis=1).to_csv(index=False, float_format="%.9g").encode()
     temporary = file.with_name(f"{file.name}.tmp")
     try:
@@ -565,12 +572,16 @@ def best_beta_per_n_envs(runs):
     """
     runs, rows = runs.assign(z=standardize(runs)), []
     for n_envs, group in runs.groupby("n_envs"):
-        group = comparable(group, ["beta"], ["environment"])
+        try:
+            group = comparable(group, ["beta"], ["environment"])
+        except Unusable:
+            continue
         table = cells_intervals(group, "z", "beta", ["environment"])
         best = table["mean"].idxmax()
         row = {"n_envs": n_envs, "best_beta": best, "environments": group.environment.nunique()}
         row |= table.loc[best].rename({"mean": "standardized_performance"}).to_dict()
         rows.append(row | {"runs": len(group)})
+    need(rows, "an environment with all betas at one n_envs")
     paper = published("best_beta_per_n_envs").set_index("n_envs").add_prefix("paper_")
     return beside_paper(pd.DataFrame(rows).set_index("n_envs"), runs, paper).reset_index()
 

@@ -242,11 +242,12 @@ def compare(runs, x, cells, by=None):
     chosen = chosen.assign(z=analysis.standardize(chosen))
     xlabel = {"beta": BETA_NAMED, "update_size": "update size n_envs \u00b7 n_steps"}.get(x, x)
     fig, [ax] = panels(1, xlabel, STANDARDIZED, height=3)
-    lines = []
+    lines, unknown = [], False
     for i, (value, group) in enumerate(chosen.groupby(by) if by else [("", chosen)]):
         gray = ["0.1", "0.65", "0.4", "0.75"][i % 4] if by else INK
         style = {"color": gray, "ls": ["-", "--", ":", "-."][i % 4], "lw": 1}
         table = analysis.cells_intervals(group, "z", x, cells)
+        unknown |= table.low.isna().any()
         if x == "beta":
             draw_betas(ax, table, shift=0.006 * i, **style)
         else:
@@ -254,7 +255,8 @@ def compare(runs, x, cells, by=None):
             draw_intervals(ax, table.index * 2 ** (0.08 * i), table, **style)
             log2_ticks(ax, chosen[x])
         lines.append((value if isinstance(value, str) else f"{by} = {value}", style))
-    ax.set_title(extent(chosen, runs))
+    no_interval = "\n(no interval where a cell has one run)" * bool(unknown)
+    ax.set_title(extent(chosen, runs) + no_interval)
     if by:
         legend_above(fig, *lines)
     return fig
@@ -325,8 +327,8 @@ def learning_curves(runs, curves, by):
     A band is its interval; open markers at the right end are the published final returns, where
     the runs' protocol is the study's.
     """
-    paper = analysis.published("final_return_per_beta").set_index([*CELL, "beta"])
-    paper = {} if analysis.differences(runs).any() else paper.final_return_mean
+    paper = analysis.published("final_return_per_beta").set_index([*CELL, "beta"]).final_return_mean
+    as_in_study = analysis.differences(runs) == ""
     fig, axes = panels(runs[by].nunique(), "environment steps", "mean return")
     for ax, (_, group) in zip(axes, runs.groupby(by), strict=True):
         environment, n_envs = group[CELL].iloc[0]
@@ -339,12 +341,13 @@ def learning_curves(runs, curves, by):
             marks = {"markevery": (i * every // 3 % line.shape[1], every), "ms": 4}
             ax.plot(line.columns, mean, **look(beta), **marks)
             ax.fill_between(line.columns, low, high, color=color(beta), alpha=0.2, lw=0)
-            final = paper.get((environment, n_envs, beta_text(beta)), np.nan)
-            ax.plot(1.05 * end, final, mfc="none", **look(beta))
+            if as_in_study[seeds.index].all():
+                final = paper.get((environment, n_envs, beta_text(beta)), np.nan)
+                ax.plot(1.05 * end, final, mfc="none", **look(beta))
         ax.set_title(f"{environment}, n_envs {n_envs}")
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
     entries = [("95 % BCa interval", {"lw": 6, "alpha": 0.3})]
-    entries += [("paper", {"marker": "o", "ls": "", "mfc": "none"})] if len(paper) else []
+    entries += [("paper", {"marker": "o", "ls": "", "mfc": "none"})] * bool(as_in_study.any())
     legend_above(fig, *entries, betas=sorted(runs.beta.unique()))
     return fig
 
@@ -383,7 +386,7 @@ def final_return_vs_n_envs(table, betas):
         ax.set(title=environment, xlim=(table.n_envs.min() / 1.5, table.n_envs.max() * 1.5))
     ours = ("ours, 95 % BCa interval", {"marker": "o", "ms": 4})
     paper = ("paper", {"ls": ":", "lw": 0.9, "marker": "o", "ms": 7, "mfc": "none"})
-    legend_above(fig, ours, *([paper] if table.paper.notna().any() else []), betas=betas)
+    legend_above(fig, ours, *[paper] * bool(table.paper.notna().any()), betas=betas)
     return fig
 
 
@@ -397,7 +400,7 @@ def robust_performance(table):
     axes[0].set_ylabel("standardized performance\n(interquartile mean)")
     axes[1].set_ylabel("probability of doing\nbetter than $\\beta = 0$")
     axes[1].axhline(0.5, color=INK, ls="--", lw=0.9)
-    made_of = f"{table.cells.iloc[0]} environments and n_envs, {table.runs.sum()} runs"
+    made_of = f"{table.cells.iloc[0]} cells of environment and n_envs, {table.runs.sum()} runs"
     fig.suptitle(f"95 % stratified bootstrap intervals, {made_of}", fontsize=9)
     return fig
 

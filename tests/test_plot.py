@@ -316,6 +316,9 @@ def test_averages_say_what_they_are_made_of(tmp_path):
     assert fig.axes[0].get_title() == title
     fig = plot.compare(runs, "beta", ["environment", "n_envs"])
     assert fig.axes[0].get_title() == "2 environments, n_envs 4, 32 (3 cells), 30 runs"
+    fewer = runs[(runs.env_id != CAR) | (runs.seed == 1)]
+    one = plot.compare(fewer, "beta", ["environment", "n_envs"])
+    assert one.axes[0].get_title().endswith("\n(no interval where a cell has one run)")
     means = fig.axes[0].lines[0].get_ydata()
     z = runs.assign(z=analysis.standardize(runs)).groupby(["beta", "environment", "n_envs"]).z
     assert means == pytest.approx(z.mean().groupby("beta").mean().to_numpy())
