@@ -329,7 +329,9 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     # Everything that can fail comes first, before run.start() touches anything of an earlier run
     with run_files.one_line_for(gym.error.Error):
         how = (args.envpool, args.threads, args.max_episode_steps)
-        video_env = environments.make_render_env(args.env_id, how[2]) if args.capture_video else None
+        video_env = (
+            environments.make_render_env(args.env_id, how[2]) if args.capture_video else None
+        )
         envs = make_vector_env(args.env_id, args.n_envs, *how)
         eval_envs = make_vector_env(args.env_id, args.eval_episodes, *how)
     obs_dim = envs.single_observation_space.shape[0]

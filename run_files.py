@@ -180,42 +180,6 @@ def make_seeds(n, *key):
     return np.random.SeedSequence(key).generate_state(n).tolist()
 
 
-def n_cores():
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-
-
-def recorded(args, name, default):
-    """The argument's value in the config.json of the run that is there already, or the default."""
-    try:
-        config = json.loads((run_path(vars(args)) / "config.json").read_text())
-        return default if args.overwrite else config["args"].get(name, default)
-    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        return default  # no run, or a damaged one, of which RunFolder speaks
-
-
-def check_device(device):
-    """Ends the program where tensors on this torch device cannot be made and read."""
-    try:
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        fail(f"--device {device} is not available here", code=2)
-
-
-# --- Helpers of the loop
-
-
-def make_seeds(n, *key):
-    """n independent seeds below 2^32, determined by the integers of the key."""
-    return np.random.SeedSequence(key).generate_state(n).tolist()
-
-
-def seed_global_generators(seeds):
-    """Seeds `random` and `numpy.random`, which some environments draw from. seeds: two integers."""
-    random.seed(seeds[0])
-    np.random.seed(seeds[1])  # noqa: NPY002
-
-
 def prepare_torch():
     """One thread, since more are slower for small networks; a compile cache that can be written."""
     torch.set_num_threads(1)
