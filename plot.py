@@ -17,6 +17,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
@@ -536,7 +537,8 @@ def parse_args():
     for command in (noise, results):
         folder = "for figures and tables; those of an earlier command are replaced or removed"
         command.add_argument("--out", type=Path, default=Path("figures"), help=f"folder {folder}")
-    sheet.add_argument("--out", default="results/environments.png", help="the picture's file")
+    picture = {"default": Path("results/environments.png"), "help": "the picture's file"}
+    sheet.add_argument("--out", type=Path, **picture)
     return parser.parse_args()
 
 
@@ -547,15 +549,10 @@ def draw_results(args):
     runs, report["left out"] = analysis.select(runs, args.method)
     grid, dropped = analysis.main_grid(runs)
     report["only where n_steps or n_epochs vary, in no other figure or table"] = dropped
-    lines = [
-        line
-        for _, part in grid.groupby(grid.env_id.isin(COMPLEX))
-        for line in analysis.missing(part)
-    ]
-    report["missing from the grid of these runs"] = lines
-    report["averaged though evaluated differently (the mean is the same)"] = (
-        analysis.mixed_evaluations(runs)
-    )
+    parts = [part for _, part in grid.groupby(grid.env_id.isin(COMPLEX))]
+    report["missing from the grid of these runs"] = sum(map(analysis.missing, parts), [])
+    mixed = analysis.mixed_evaluations(runs)
+    report["averaged though evaluated differently (the mean is the same)"] = mixed
     asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
     betas = asked or three_betas(grid[~grid.vanilla])
     others = sorted(set(grid.beta.dropna()) - set(betas))
@@ -585,6 +582,8 @@ def main():
         made, _ = make_all(noise(sorted({beta + 0.0 for beta in args.beta})), args.out)
         print(f"{args.out}: {', '.join(made)}")
     else:
+        if args.out.suffix[1:] not in FigureCanvasBase.filetypes or not args.out.parent.is_dir():
+            raise Unusable(f"--out {args.out} is not a picture's name in a folder that exists")
         silence()
         contact_sheet().savefig(args.out, dpi=85)
 

@@ -111,6 +111,8 @@ def test_runs_that_cannot_be_used_are_listed(tmp_path, run):
         (["analysis.py pack", "runs", "nowhere/packed.csv"], "nowhere"),
         (["plot.py noise", "--beta", "nan"], "--beta"),
         (["plot.py noise", "--beta", "1", "--out", "file.csv/figures"], "file.csv"),
+        (["plot.py environments", "--out", "picture.xyz"], "picture.xyz"),
+        (["plot.py environments", "--out", "nowhere/picture.png"], "nowhere/picture.png"),
         (["plot.py"], "command"),
         (["analysis.py"], "command"),
         (["analysis.py status", "nowhere"], "nowhere"),
