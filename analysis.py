@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from colored_noise import mean_std
 from environments import NAMES
-from run_files import FREE_ARGS, fail
+from run_files import ABSENT, FREE_ARGS, fail
 
 try:
     import fcntl
@@ -44,9 +44,6 @@ STUDY = {
     "normalize_advantage": True, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5,
 }
 # fmt: on
-# What runs did that are older than the argument
-ABSENT = {"method": "ppo", "envpool": False, "anneal_lr": False, "max_episode_steps": None}
-ABSENT |= {"eval_once_per_policy": False, "threads": 1}
 # The study varies AXES. Other arguments must not vary within an environment, but these: EVALUATION
 # changes how closely a policy's return is measured, and not what its mean is; FREE_ARGS change
 # nothing; NOT_ARGUMENTS are no arguments, or shown by others.

@@ -655,6 +655,23 @@ def test_envpool_is_the_default_and_a_resumed_run_keeps_it(train, tiny, tmp_path
     assert used() == (importlib.util.find_spec("envpool") is not None)
 
 
+def test_runs_of_earlier_versions(train, tiny, tmp_path):
+    """Arguments that they do not know had their defaults."""
+    assert train(f"{tiny} --no-envpool").returncode == 0
+    path = only_run(tmp_path) / "config.json"
+    config = json.loads(path.read_text())
+    for name in ("method", "anneal_lr", "max_episode_steps", "eval_once_per_policy", "threads"):
+        del config["args"][name]
+    path.write_text(json.dumps(config))
+    assert "complete" in train(tiny).stdout
+    assert_one_line_error(train(f"{tiny} --anneal-lr"), "--anneal-lr False, not True", code=2)
+    (only_run(tmp_path) / "summary.json").unlink()
+    checkpoint = torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)
+    del checkpoint["agent"]
+    torch.save(checkpoint, only_run(tmp_path) / "checkpoint.pt")
+    assert_one_line_error(train(f"{tiny} --resume"), "earlier version", code=1)
+
+
 def test_importing_has_no_effect_and_needs_nothing_of_unix():
     code = """
 import os, sys
