@@ -381,7 +381,7 @@ def test_failed_run_does_not_stop_the_others(tmp_path):
         result = tiny.run("-j", "1")
         assert result.returncode == 1
         assert (good / "summary.json").exists()
-        line = f"failed with exit code 1: {bad}: error: training diverged"
+        line = f"failed: {bad}: exit code 1: error: training diverged"
         assert line in result.stdout.splitlines()
         assert starts(bad) == 1, attempt
     assert tiny.status() == "quick: 1 of 2 done, 0 running, 1 failed, 0 to do"
@@ -393,7 +393,7 @@ def test_killed_five_times_is_failed(tmp_path):
     tiny = Tiny(tmp_path / "runs")
     tiny.fake("os.kill(os.getpid(), 9)")
     result = tiny.run("-j", "1")
-    assert result.returncode == 1 and "failed with exit code 137" in result.stdout
+    assert result.returncode == 1 and ": exit code 137: " in result.stdout
     assert starts(tiny.folders[0]) == 5
 
 
