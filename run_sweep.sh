@@ -13,12 +13,10 @@
 #   transfer  TRPO and A2C (baselines.py), 16 environments, 8 betas, n_envs 4                   5120
 #   gsde      gSDE (baselines.py) in place of colored noise, 16 environments, n_envs 1 to 128   2560
 # what to run, quoted lists in place of the preset's
-#   --envs "A B"        short names such as cheetah-run of the environments below, or any id of the
-#                       form NAME-v0 or MODULE:NAME
-#   --betas "0 0.5"     noise colors; likewise --n-envs "4 8" and --seeds "1 2 3"
-#   --n-epochs "5 20"   only in the preset n_epochs
-#   --exp-name NAME     the experiment's folder (ppo_colored_continuous; trpo, a2c, gsde); n_steps
-#                       and n_epochs add _n_steps_1024 and the like
+#   --envs "A B"        those below (or short: cheetah-run), or any id NAME-v0 or MODULE:NAME
+#   --betas "0 0.5"     likewise --n-envs "4 8", --seeds "1 2 3"; in n_epochs --n-epochs "5 20"
+#   --exp-name NAME     folder of the experiment (ppo_colored_continuous; trpo, a2c, gsde), to which
+#                       n_steps and n_epochs add _n_steps_1024 and the like
 #   --runs-dir FOLDER   where the experiments are (runs); on a cluster, all nodes must share it
 #   -- FLAGS            for every run, as in "-- --device cpu". Those that change the result need an
 #                       --exp-name of their own: a run's path does not show them.
@@ -33,9 +31,10 @@
 #   --runs-per-task K   runs in a task of the array (4; 1 for the ant, which takes over an hour)
 #
 # PYTHON names the interpreter (python), as in PYTHON=.venv/bin/python ./run_sweep.sh quick
-# Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was, and on a
-# second machine that sees the folder it shares the work. What a run says is in log.txt in its
-# folder, why it failed in the file "failed" there.
+# Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was. On a
+# second machine that sees the runs folder it shares the work. A run's output is in log.txt in its
+# folder. A failed run has its exit code and error in the file "failed" there; it is not tried again
+# without --retry-failed.
 # Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
 
 # shellcheck disable=SC2086,SC2206 # lists of words stand without quotes on purpose
@@ -72,7 +71,7 @@ parse_args() {
   local word words n='[1-9][0-9]{0,8}'
   local -A allowed=([--envs]='[A-Za-z0-9_./:-]+' [--betas]='-?([0-9]+\.?[0-9]*|\.[0-9]+)'
     [--n-envs]=$n [--seeds]="0|$n" [--n-epochs]=10 [--exp-name]='[A-Za-z0-9_][A-Za-z0-9._-]*'
-    [--runs-dir]='[^-[:cntrl:]][^[:cntrl:]]*' [-j]=$n [--sbatch]='.*' [--runs-per-task]=$n
+    [--runs-dir]='[^-[:cntrl:]][^[:cntrl:]]*' [-j]=$n [--sbatch]='.+' [--runs-per-task]=$n
     [--task]='[0-9]+:[0-9]+')
   option=([--envs]=$study_envs [--betas]="-1 0 0.2 0.5 0.75 1 1.25 2" [--n-envs]=4
     [--seeds]=$(echo {1..20}) [--n-epochs]=10 [--runs-dir]=runs)
@@ -100,9 +99,8 @@ parse_args() {
       --) run_flags=("${@:2}") && break ;;
       *)
         [[ -n ${allowed[$1]-} ]] || die "unknown argument '$1' (--help; flags for runs follow --)"
-        [[ ${2-} == *[^[:space:]]* ]] || die "$1 needs a value (--help)"
-        if [[ $1 == *s ]]; then words=($2); else words=("$2"); fi # plurals are lists
-        for word in "${words[@]}"; do
+        if [[ $1 == *s ]]; then words=(${2-}); else words=("${2-}"); fi # plurals are lists
+        for word in "${words[@]:-}"; do
           [[ $word =~ ^(${allowed[$1]})$ ]] || die "$1: '$word' is not allowed here (--help)"
         done
         option[$1]=$2 && shift
@@ -164,7 +162,7 @@ last_line() { # of what the run in folder $1 said since its last start; its erro
     END { print error ? error : last ? last : "(it said nothing)" }'
 }
 
-halt() { # problem: ends the whole sweep, also from a run's own process
+halt() { # problem: ends the whole sweep; run() calls it in its own process
   echo "run_sweep.sh: stopped: $1" >&2
   kill -USR2 $$
   exit 1
@@ -214,36 +212,35 @@ work() { # starts what is free until nothing is left; waits for runs of others, 
       [[ -z $stopping ]] || break
       check_runs_dir
       attempts[i]=$((${attempts[i]-0} + 1)) started=yes
-      # In a process group of its own: Ctrl-C reaches the sweep alone, and stop() tells each run
-      # once. At a second signal a run ends without saving.
-      set -m
+      set -m # in a process group of its own: Ctrl-C reaches the sweep alone, which tells it once
       run "$i" "${attempts[i]}" &
       set +m
     done
     until wait; do :; done # a signal ends a wait
     [[ -z $started ]] || continue
-    [[ $n_left != 0 && $mode == local ]] || return
-    [[ $waiting == "$n_left" ]] || echo "waiting for $n_left runs that other processes have taken"
-    waiting=$n_left
+    ((n_left)) && [[ $mode == local ]] || return
+    [[ -n $waiting ]] || echo "waiting for $n_left runs that other processes have taken"
+    waiting=yes
     sleep 2
   done
 }
 
 # shellcheck disable=SC2317 # reachable, by traps
-stop() { # exit code: ends the runs, which save what they have; the second time without
-  local group signal=TERM
-  [[ -z $stopping ]] || signal=KILL
+stop() { # exit code: ends the runs, which save what they have; at a second signal they do not
+  local group
   stopping=$1
-  for group in $(jobs -p); do kill -s "$signal" -- "-$group" 2>/dev/null; done
+  for group in $(jobs -p); do kill -- "-$group" 2>/dev/null; done
 }
 
 report() { # lists what failed, and counts; true where all runs are complete
   local folder complete=0 failed=0
   for folder in "${folders[@]}"; do
-    [[ ! -e $folder/summary.json ]] || complete=$((complete + 1))
-    [[ -e $folder/failed && ! -e $folder/summary.json ]] || continue
-    failed=$((failed + 1))
-    echo "failed: $folder: $(<"$folder/failed")"
+    if [[ -e $folder/summary.json ]]; then
+      complete=$((complete + 1))
+    elif [[ -e $folder/failed ]]; then
+      failed=$((failed + 1))
+      echo "failed: $folder: $(<"$folder/failed")"
+    fi
   done
   ((failed == 0)) || echo "all they said is in log.txt there; --retry-failed takes them up again"
   echo "$preset: $complete of ${#folders[@]} runs are complete, $failed failed"
@@ -285,7 +282,7 @@ END
 
 main() {
   local python=${PYTHON:-python} scripts stopping='' folders=() commands=() text first count
-  local -A option=()
+  local -A option
   scripts=$(dirname "$0")
   parse_args "$@"
   runs_dir=${option[--runs-dir]%/} jobs=${option[-j]-}
