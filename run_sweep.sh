@@ -162,7 +162,7 @@ last_line() { # of what the run in folder $1 said since its last start; its erro
     END { print error ? error : last ? last : "(it said nothing)" }'
 }
 
-halt() { # problem: ends the whole sweep; run() calls it in its own process
+halt() { # problem: ends a run's process, and by it the whole sweep
   echo "run_sweep.sh: stopped: $1" >&2
   kill -USR2 $$
   exit 1
@@ -183,6 +183,7 @@ check_runs_dir() { # is it there, does it take a megabyte, and has it locks?
 run() { # number, attempt: does a run, in a process of its own, unless another sweep is faster
   local folder=${folders[$1]} code reason
   trap 'stopping=yes' TERM # and wait for the run, which saves
+  check_runs_dir
   { mkdir -p "$folder" && exec 9>>"$folder/log.txt"; } || halt "cannot write to $folder"
   flock -n 9 && is_left "$folder" && [[ -z $stopping ]] || exit
   printf '\n== %(%F %T)T %s: %s\n' -1 "$HOSTNAME" "${commands[$1]}" >&9
@@ -210,7 +211,6 @@ work() { # starts what is free until nothing is left; waits for runs of others, 
       is_locked "${folders[i]}/log.txt" || is_locked "${folders[i]}/lock" && continue
       while mapfile -t active < <(jobs -rp) && ((${#active[@]} >= jobs)); do wait -n; done
       [[ -z $stopping ]] || break
-      check_runs_dir
       attempts[i]=$((${attempts[i]-0} + 1)) started=yes
       set -m # in a process group of its own: Ctrl-C reaches the sweep alone, which tells it once
       run "$i" "${attempts[i]}" &
