@@ -14,7 +14,7 @@
 #   gsde      gSDE (baselines.py) in place of colored noise, 16 environments, n_envs 1 to 128   2560
 # what to run, quoted lists in place of the preset's
 #   --envs "A B"        those below (or short: cheetah-run), or any id NAME-v0 or MODULE:NAME
-#   --betas "0 0.5"     likewise --n-envs "4 8", --seeds "1 2 3"; in n_epochs --n-epochs "5 20"
+#   --betas "0 0.5"     noise colors; likewise --n-envs, --seeds; in n_epochs --n-epochs "5 20"
 #   --exp-name NAME     folder of the experiment (ppo_colored_continuous; trpo, a2c, gsde), to which
 #                       n_steps and n_epochs add _n_steps_1024 and the like
 #   --runs-dir FOLDER   where the experiments are (runs); on a cluster, all nodes must share it
@@ -162,10 +162,9 @@ last_line() { # of what the run in folder $1 said since its last start; its erro
     END { print error ? error : last ? last : "(it said nothing)" }'
 }
 
-halt() { # problem: ends a run's process, and by it the whole sweep
-  echo "run_sweep.sh: stopped: $1" >&2
+halt() { # problem: ends the whole sweep, from a run's process
   kill -USR2 $$
-  exit 1
+  die "stopped: $1" 1
 }
 
 check_runs_dir() { # is it there, does it take a megabyte, and has it locks?
@@ -262,8 +261,8 @@ submit() { # the script's arguments: cuts what is left into tasks, and submits t
   ((n_left)) || { echo "$preset: nothing to do"; return; }
   mkdir -p "$runs_dir/slurm" || exit 1
   echo "$n_left runs in ${#starts[@]} tasks; their messages: $runs_dir/slurm" || exit 1
-  # A task is this very command with --task FIRST:END, its part of the list: from its start to the
-  # next one's. USR1 comes two minutes before the time limit: it stops its runs and queues again.
+  # A task is this very command with --task FIRST:END, its part of the list: from where it starts to
+  # where the next one does. USR1 comes two minutes before the time limit: main() queues it again.
   for ((i = 0; i < ${#starts[@]}; i += max)); do
     size=$((${#starts[@]} - i < max ? ${#starts[@]} - i : max))
     job=$(sbatch --parsable --job-name="$preset" --array="0-$((size - 1))" --requeue \
@@ -289,7 +288,7 @@ main() {
   list_runs
   if [[ $mode == print ]]; then
     printf '%s\n' "${commands[@]}"
-    exit
+    exit # with printf's code
   elif [[ $mode == status ]]; then
     text=$(printf '%s\n' "${folders[@]}" |
       "$python" "$scripts/analysis.py" status - --name "$preset") && echo "$text"
@@ -309,7 +308,7 @@ main() {
   trap '[[ -n $stopping ]] || stop 1' USR2
   mkdir -p "$runs_dir" || exit 1
   check_runs_dir
-  [[ -z $retry_failed ]] || rm -f "${folders[@]/%//failed}"
+  [[ -z $retry_failed ]] || printf '%s/failed\0' "${folders[@]}" | xargs -0 rm -f
   [[ $mode != slurm ]] || { submit "$@"; exit; }
 
   echo "$preset: ${#folders[@]} runs, $jobs at a time" || exit
