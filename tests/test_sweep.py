@@ -328,6 +328,31 @@ def test_output_that_cannot_be_written_is_an_error(tmp_path, args):
     assert not list(tiny.runs.rglob("log.txt")) and not (tmp_path / "submitted").exists()
 
 
+def test_slurm_tasks_are_parts_of_the_list(tmp_path):
+    """Without Slurm: what sbatch is given; the ant's runs have tasks of their own."""
+    tiny = Tiny(tmp_path / "my runs")
+    tiny.fake(FINISH)
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    sbatch = f"cat >{tmp_path}/batch.$(ls {tmp_path} | grep -c batch); echo 7"
+    for tool, says in {"sbatch": sbatch, "scontrol": "echo MaxArraySize = 2"}.items():
+        (tools / tool).write_text(f"#!/bin/sh\n{says}\n")
+        (tools / tool).chmod(0o755)
+    env = {**tiny.env, "PATH": f"{tools}:{os.environ['PATH']}"}
+    args = ["main", "--envs", "AntUMaze door", "--betas", "0 1", "--n-envs", "4 8", "--seeds", "1"]
+    args += ["--runs-dir", str(tiny.runs), "--retry-failed", "--slurm", "--", "--note", "it's"]
+    result = sweep(*args, env=env)
+    assert result.stdout.startswith("8 runs in 5 tasks; ") and "as job 7 7 7;" in result.stdout
+    done = []
+    for batch in (f"batch.{i}" for i in range(3)):
+        for task in ("0", "1") if batch != "batch.2" else ("0",):
+            how = {"env": {**env, "SLURM_ARRAY_TASK_ID": task}, "capture_output": True}
+            assert subprocess.run(["bash", tmp_path / batch], **how).returncode == 0
+            done.append(len(list(tiny.runs.rglob("summary.json"))))
+    assert done == [1, 2, 3, 4, 8]
+    assert "nothing to do" in sweep(*args, env=env).stdout
+
+
 def test_interpreter_is_tried_before_anything_starts(tmp_path):
     tiny = Tiny(tmp_path / "runs")
     tiny.fake(FINISH)
@@ -381,7 +406,7 @@ def test_failed_run_does_not_stop_the_others(tmp_path):
         result = tiny.run("-j", "1")
         assert result.returncode == 1
         assert (good / "summary.json").exists()
-        line = f"failed with exit code 1: {bad}: error: training diverged"
+        line = f"failed: {bad}: exit code 1: error: training diverged"
         assert line in result.stdout.splitlines()
         assert starts(bad) == 1, attempt
     assert tiny.status() == "quick: 1 of 2 done, 0 running, 1 failed, 0 to do"
@@ -393,7 +418,7 @@ def test_killed_five_times_is_failed(tmp_path):
     tiny = Tiny(tmp_path / "runs")
     tiny.fake("os.kill(os.getpid(), 9)")
     result = tiny.run("-j", "1")
-    assert result.returncode == 1 and "failed with exit code 137" in result.stdout
+    assert result.returncode == 1 and ": exit code 137: " in result.stdout
     assert starts(tiny.folders[0]) == 5
 
 
