@@ -348,21 +348,21 @@ def select(runs, method="ppo"):
 
 
 def select_methods(runs, method="ppo"):
-    """`select` for a method, and for each of the paper's other methods, never averaged with it.
+    """`select` for a method, and for the paper's other methods, never averaged with it.
 
-    Returns a dict, method: its runs, of those that have any, and the lines of all.
+    Returns a dict, method: its runs, the first `method` even if it has none, then those that have
+    any; and the lines of all. Raises Unusable where no method has any.
     """
-    chosen, left_out = {}, []
+    chosen, left_out = {method: runs[:0].assign(vanilla=False)}, []
+    complete = set(runs.method[runs.status == "complete"])
     for name in dict.fromkeys([method, *METHODS]):
-        others = set(METHODS) - {method} if name == method else set(runs.method) - {name}
-        part = runs[~runs.method.isin(others)]
-        if (part.method[part.status == "complete"] == name).any():
+        apart = set(METHODS) - {method} if name == method else set(runs.method) - {name}
+        part = runs[~runs.method.isin(apart)]
+        if name in complete or name == method and not complete & set(METHODS):
             chosen[name], lines = select(part, name)
         else:
             lines = (part.source + "/" + part.path + ": " + part.status).tolist()
         left_out += lines
-    if not chosen:
-        select(runs, method)  # says why
     return chosen, left_out
 
 
@@ -394,6 +394,8 @@ def main_grid(runs):
 
     Returns them, and a line for each environment that has no such runs.
     """
+    if runs.empty:
+        return runs, []
     settings = pd.Series(list(zip(runs.n_steps, runs.n_epochs, strict=True)), index=runs.index)
     setting = (2048, 10) if (2048, 10) in set(settings) else settings.mode()[0]
     grid, dropped = runs[settings == setting], []
