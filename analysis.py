@@ -245,14 +245,14 @@ def load(paths, env=None, beta=None, n_envs=None):
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1] if len(curves.columns) else np.nan
     keep = pd.Series(True, runs.index)
     for flag, wanted in (("env", env), ("beta", beta), ("n_envs", n_envs)):
-        columns, keep_before = ["environment", "env_id"] if flag == "env" else [flag], keep
+        columns = ["environment", "env_id"] if flag == "env" else [flag]
         for value in wanted or []:
             if not (runs[columns] == value).any(axis=None):
                 there = ", ".join(f"{x:g}" if flag == "n_envs" else x for x in present(runs, flag))
                 flag = flag.replace("_", "-")
                 raise Unusable(f"no runs with --{flag} {value}; there are: {there or 'none'}")
-        keep &= runs[columns].isin(wanted).any(axis=1) if wanted else True
-        keep |= (flag == "beta") & keep_before & (runs.method == "gsde")  # it has no beta
+        asked = runs[columns].isin(wanted or []).any(axis=1) | (not wanted)
+        keep &= asked | (flag == "beta") & (runs.method == "gsde")  # which has no beta
     keep |= runs.env_id.isna()  # damaged ones stay, to be listed
     return runs[keep], curves[keep]
 
@@ -999,7 +999,8 @@ def drawn_grids(runs, draws=1000):
 def larger_n_envs_larger_beta(runs):
     """The best beta's slope over log2 n_envs is positive."""
     grid, drawn = drawn_grids(runs)
-    x = np.log2(grid.columns.to_numpy()) - np.log2(grid.columns).mean()
+    x = np.log2(grid.columns.to_numpy())
+    x = x - x.mean()
     slope = grid.idxmax().to_numpy() @ x / (x**2).sum()
     ends = np.percentile(grid.index.to_numpy()[drawn.argmax(1)] @ x / (x**2).sum(), [2.5, 97.5])
     found = ", ".join(f"{n}: {beta:g}" for n, beta in grid.idxmax().items())
