@@ -235,7 +235,8 @@ def load(paths, env=None, beta=None, n_envs=None):
     runs = runs.reindex(columns=runs.columns.union(["env_id", *AXES, *ABSENT], sort=False))
     for argument, value in ABSENT.items():
         runs[argument] = runs[argument].astype(object).where(runs[argument].notna(), value)
-    runs.loc[runs.method == "gsde", "beta"] = "gsde"  # what its arguments say was not used
+    # gSDE does not use the beta of its arguments
+    runs["beta"] = runs.beta.astype(object).mask(runs.method == "gsde", "gsde")
     names = runs.env_id.map(lambda env_id: NAMES.get(env_id, env_id), na_action="ignore")
     runs["environment"] = names
     # Sec. "Evaluation Details": performance is the mean over all evaluations, the area under the
@@ -353,7 +354,8 @@ def select_methods(runs, method="ppo"):
     Returns a dict, method: its runs, the first `method` even if it has none, then those that have
     any; and the lines of all. Raises Unusable where no method has any.
     """
-    chosen, left_out = {method: runs[:0].assign(vanilla=False)}, []
+    none = runs[:0].astype({**dict.fromkeys(WHOLE, int), "beta": float})
+    chosen, left_out = {method: none.assign(vanilla=np.zeros(0, bool))}, []
     complete = set(runs.method[runs.status == "complete"])
     for name in dict.fromkeys([method, *METHODS]):
         apart = set(METHODS) - {method} if name == method else set(runs.method) - {name}

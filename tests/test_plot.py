@@ -391,7 +391,7 @@ def test_vanilla_alone(tmp_path, run):
         "plot.py results", tmp_path / "runs", "--beta", "vanilla", "--out", out
     )
     assert code == 0, stderr
-    assert stdout.startswith(f"{out}: final_returns, final_return_per_beta\n")
+    assert stdout.startswith(f"{out}: final_returns, final_return_per_beta, coverage\n")
     report = (out / "report.txt").read_text()
     assert "final_return_vs_n_envs: needs runs with colored noise" in report
 
