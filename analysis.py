@@ -11,6 +11,7 @@ with its appendix.
 import argparse
 import gzip
 import io
+import itertools
 import json
 import math
 import os
@@ -806,8 +807,9 @@ def outside(table):
 def contrast(runs, weights, by, cells=("environment",), of=16):
     """A weighted sum of groups' means of `z`, averaged over cells and environments, and its error.
 
-    In each cell with all groups: the sum of weight times mean over seeds. Its mean over an
-    environment's cells is averaged over environments. Their E are taken for a sample of `of`, the
+    In each cell with all groups: the sum of weight times mean over seeds; only where each has two
+    seeds, if such cells are there. Its mean over an environment's cells is averaged over
+    environments. Their E are taken for a sample of `of`, the
     seeds for a sample of each (Cochran, Sampling Techniques, Sec. 10.3): with f = E / of the
     variance is (1 - f) s^2 / E between environments + f / E times the mean variance by seeds. So
     16 of 16 are the study itself, where only seeds are chance. Degrees of freedom: Satterthwaite.
@@ -825,7 +827,8 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
         return nothing
     each = [groups.agg(how).unstack(by).reindex(columns=weight.index) for how in ("mean", "var")]
     each.append(groups.size().unstack(by).reindex(columns=weight.index))
-    mean, variance, seeds = (table[each[0].notna().all(axis=1)] for table in each)
+    there, two = each[0].notna().all(axis=1), each[1].notna().all(axis=1)
+    mean, variance, seeds = (table[two if two.any() else there] for table in each)
     if mean.empty:
         return nothing
     environments = mean.index.get_level_values("environment")
@@ -917,15 +920,16 @@ def best(runs, winner, rivals, by, **more):
 
 
 def color_matters(runs):
-    """Some beta does better than some other, all pairs tested."""
-    there = runs.groupby("beta").z.mean().sort_values()
-    pairs = len(there) * (len(there) - 1) / 2
-    found = contrast(runs, {there.index[0]: -1, there.index[-1]: 1}, "beta", CELL)
-    if not pairs or not found["environments"]:
+    """Some beta does better than some other, all pairs tested; the widest apart is shown."""
+    pairs = list(itertools.permutations(sorted(runs.beta.unique()), 2))
+    found = {pair: contrast(runs, {pair[0]: 1, pair[1]: -1}, "beta", CELL) for pair in pairs}
+    found = {pair: each for pair, each in found.items() if each["environments"]}
+    if not found:
         return "open", NONE
-    apart = found["enough"] and interval(found, 0.05 / pairs)[0] > 0
-    what = f"{there.index[-1]:g} over {there.index[0]:g}"
-    return ("holds" if apart else "open"), words(what, found)
+    apart = [each["enough"] and interval(each, 0.1 / len(pairs))[0] > 0 for each in found.values()]
+    first, second = max(found, key=lambda pair: (found[pair]["enough"], found[pair]["mean"]))
+    text = words(f"{first:g} over {second:g}", found[first, second])
+    return ("holds" if any(apart) else "open"), text
 
 
 def best_beta_varies(runs):
@@ -955,8 +959,8 @@ def comparable_counts(runs, draws=300):
     for _, group in runs.groupby("environment"):
         cells = group.groupby(["beta", "n_envs"]).performance.apply(np.array).unstack()
         cells = cells.dropna(axis=1)
-        enough = cells.shape[1] >= 3 and cells.map(len).min(axis=None) > 1
-        if not enough or not {*betas} <= {*cells.index} or runs.environment.nunique() < 16:
+        cells = cells.loc[:, cells.map(len).min() > 1]
+        if cells.shape[1] < 3 or not {*betas} <= {*cells.index} or runs.environment.nunique() < 16:
             return "open", text
         sides = []
         for samples in cells.to_numpy():  # each beta's (n_envs, seeds)
@@ -984,12 +988,14 @@ def drawn_grids(runs, draws=1000):
     makes the variance right (Rao and Wu 1988). Of the betas and n_envs that half of the
     environments have. Returns the grid, (betas, n_envs), and the draws, (draws, betas, n_envs).
     """
+    runs = runs[runs.groupby(["environment", "beta", "n_envs"]).z.transform("size") > 1]
     there = runs.groupby(["beta", "n_envs"]).environment.transform("nunique")
-    runs, rng = comparable(runs[there >= 8], ["beta", "n_envs"], ["environment"]), None
+    need((there >= 8).any(), "two seeds in eight environments")
+    runs = comparable(runs[there >= 8], ["beta", "n_envs"], ["environment"])
     cells = runs.groupby(["environment", "beta", "n_envs"]).z.apply(np.array)
     E, grid = runs.environment.nunique(), cells.map(np.mean).groupby(level=[1, 2]).mean().unstack()
     need(grid.notna().all(axis=None) and min(grid.shape) > 2, "three betas at each of three n_envs")
-    need(E >= 8 and cells.map(len).min() > 1, "two seeds in eight environments")
+    need(E >= 8, "eight environments with all betas and n_envs that eight have")
     rng = np.random.default_rng(0)
     z = [x[rng.integers(len(x), size=(draws, len(x) - 1))].mean(1) for x in cells]
     z = np.array(z).reshape(E, -1, draws)

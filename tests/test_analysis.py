@@ -809,6 +809,12 @@ def test_the_best_beta_and_the_rule():
         found, table = verdicts(ppo=runs)
         assert (found[best], found[white]) == ("open", "open")
         assert table.runs[best] == f"{count} of 20480"
+    # An environment with one seed more, or with more betas, takes nothing away
+    first = whole.env_id == SIXTEEN[3]
+    rest = whole[~first & whole.beta.isin([0, 0.5, 1]) & whole.n_envs.isin([1, 4, 32])]
+    more = whole[first & ((whole.seed == 0) | (whole.beta == 0.5))]
+    (without, _), (found, _) = verdicts(ppo=rest), verdicts(ppo=pd.concat([rest, more]))
+    assert found == without and found[white] == "holds"
     # A cell counts no more than the paper's twenty seeds
     many = made_up(level, envs=[CAR], betas=[0], n_envs=[4], seeds=30)
     assert verdicts(ppo=many)[1].runs[best] == "20 of 20480"
