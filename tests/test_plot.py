@@ -493,7 +493,7 @@ def test_the_coverage_of_the_measured_results(tmp_path, run):
     known = {*known, *NOISE, "results/environments.png", "learning_curves_n_envs_*"}
     known |= {"learning_curves_mountain_car"}
     assert set(table.file) <= known
-    for preset in presets - {"transfer", "gsde"}:
+    for preset in presets:
         assert f"#   {preset} " in help_text, preset
     said = table.set_index("says")
     assert (
