@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from colored_noise import autocovariance, mean_std
 from environments import COMPLEX, NAMES
-from run_files import FREE_ARGS, fail
+from run_files import ABSENT, FREE_ARGS, fail
 
 try:
     import fcntl
@@ -50,9 +50,6 @@ STUDY = {
 # What methods have in common that are compared
 SHARED = ["total_timesteps", "eval_freq", "max_episode_steps", "noise_seq_len", "gamma"]
 SHARED += ["anneal_lr", "bootstrap_timeouts"]
-# What runs did that are older than the argument
-ABSENT = {"method": "ppo", "envpool": False, "anneal_lr": False, "max_episode_steps": None}
-ABSENT |= {"eval_once_per_policy": False, "threads": 1}
 # The study varies AXES. Other arguments must not vary within an environment, but these: EVALUATION
 # changes how closely a policy's return is measured, and not what its mean is; FREE_ARGS change
 # nothing; NOT_ARGUMENTS are no arguments, or shown by others.

@@ -40,6 +40,9 @@ PACKAGES += ["envpool"]
 # How a run is carried out, not what it computes: these may change between a run and its --resume.
 FREE_ARGS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "capture_video"}
 FREE_ARGS |= {"track"}
+# What runs did that are older than the argument
+ABSENT = {"method": "ppo", "envpool": False, "anneal_lr": False, "max_episode_steps": None}
+ABSENT |= {"eval_once_per_policy": False}
 SECONDS_BETWEEN_CHECKPOINTS = 5
 
 # --- The end of a program: mistakes and signals
@@ -159,7 +162,7 @@ def recorded(args, name, default):
     """The argument's value in the config.json of the run that is there already, or the default."""
     try:
         config = json.loads((run_path(vars(args)) / "config.json").read_text())
-        return default if args.overwrite else config["args"].get(name, default)
+        return default if args.overwrite else (ABSENT | config["args"])[name]
     except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
         return default  # no run, or a damaged one, of which RunFolder speaks
 
@@ -460,7 +463,7 @@ class RunFolder:
 
     def _check_same_run(self):
         """Refuses to mix runs: what decides the result must be the same as in config.json."""
-        old = self._read_json("config.json").get("args", {})
+        old = ABSENT | self._read_json("config.json").get("args", {})
         args = json.loads(json.dumps(self._args))
         for name in sorted((old.keys() | args.keys()) - FREE_ARGS):
             if old.get(name) != args.get(name):
@@ -473,6 +476,8 @@ class RunFolder:
         try:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
             size = checkpoint["file_sizes"]["evaluations.csv"]
+            if "agent" not in checkpoint:
+                raise ValueError("it is of an earlier version of this code")
             if (self.path / "evaluations.csv").stat().st_size < size:
                 raise ValueError("evaluations.csv is shorter than it was")
         except Exception as error:  # torch.load raises nearly anything on a damaged file

@@ -112,15 +112,17 @@ def test_trpo_search_direction(monkeypatch):
     agent, *_ = make_pair(TRPO, "trpo")
     batch = random_batch(agent)
     params, _ = initial_state(agent)
-    kl = lambda p: baselines.kl_divergence(p, params, batch[0], agent)  # noqa: E731
-    hessian = torch.autograd.functional.hessian(kl, params) + 0.1 * torch.eye(len(params))
+
+    def product(vector):
+        kl = lambda p: baselines.kl_divergence(p, params, batch[0], agent)  # noqa: E731
+        return torch.autograd.functional.hvp(kl, params, vector)[1] + 0.1 * vector
+
     gradient = torch.func.grad(baselines.surrogate)(params, batch, agent)
     monkeypatch.setattr(torch, "randn_like", torch.zeros_like)
-    theirs = conjugate_gradient_solver(lambda v: hessian @ v, gradient, max_iter=15)
-    ours = baselines.conjugate_gradient(lambda v: hessian @ v, gradient)
+    theirs = conjugate_gradient_solver(product, gradient, max_iter=15)
+    ours = baselines.conjugate_gradient(product, gradient)
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
-    exact = torch.linalg.solve(hessian, gradient)
-    assert torch.cosine_similarity(ours, exact, dim=0) > 0.99
+    assert torch.cosine_similarity(product(ours), gradient, dim=0) > 0.99
 
 
 def gsde_pair():

@@ -54,7 +54,7 @@ def run(code, folder):
 @pytest.mark.parametrize(
     "env_id, words",
     [
-        ("FetchReach-v4", ["unknown environment FetchReach-v4", "my_env:FetchReach-v4"]),
+        ("MyReach-v4", ["unknown environment MyReach-v4", "my_env:MyReach-v4"]),
         ("Pendulum-v9", ["Pendulum-v9; did you mean Pendulum-v1"]),
         ("dm_control/cheetah-fly-v0", ["did you mean dm_control/cheetah-run-v0"]),
         ("0123456789", ["unknown environment 0123456789"]),
@@ -64,7 +64,6 @@ def run(code, folder):
         ("a:b:c", ["no a:b.py"]),
         ("CartPole-v1", ["Discrete(2)"]),
         ("Pendulum-v0", ["deprecated"]),
-        ("HalfCheetah-v3", ["gymnasium-robotics"]),
         ("", ["Malformed"]),
     ],
 )
