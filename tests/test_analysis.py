@@ -910,6 +910,8 @@ def test_claims_on_other_methods():
     assert [found[claim] for claim in claims] == ["holds", "holds", "holds", "holds"]
     assert table.runs[claims[3]] == "720 of 7680" and table.runs[claims[0]] == "240 of 2560"
     assert table.command[claims[0]] == "./run_sweep.sh transfer; python plot.py results runs/"
+    few = made_up(lambda e, beta, n: beta, SIXTEEN[:7], n_envs=[4], method="trpo")
+    assert verdicts(trpo=few)[0][claims[0]] == "open"  # less than half of the environments
     found, _ = transfer(-0.5, 2, -3)
     assert [found[claim] for claim in claims] == ["does not", "holds", "does not", "does not"]
 
