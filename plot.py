@@ -45,6 +45,12 @@ plt.rc("pdf", fonttype=42)  # TrueType: journals refuse Type 3 fonts
 INK = "0.25"  # what is not about one beta
 BETA = r"noise color $\beta$"
 BETA_NAMED = f"{BETA} (-1 blue, 0 white, 1 pink, 2 red)"
+METHOD_NAMES = {"ppo": "PPO", "trpo": "TRPO", "a2c": "A2C"}
+METHOD_LOOK = {  # Okabe and Ito's colors, told apart by all
+    "ppo": {"color": "#0072B2", "marker": "o"},
+    "trpo": {"color": "#D55E00", "marker": "s", "ls": "--"},
+    "a2c": {"color": "#000000", "marker": "^", "ls": ":"},
+}
 STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 
 
@@ -353,6 +359,64 @@ def learning_curves(runs, curves, by):
     return fig
 
 
+def transfer(runs):
+    """Sec. A7: standardized performance against beta of (a) TRPO, (b) A2C, (c) all with PPO's.
+
+    runs: of the three methods, n_envs 4. (a) and (b) are standardized over one method's runs in an
+    environment, (c) over all; each over the environments that have all betas (of all methods).
+    """
+    methods = [method for method in METHOD_LOOK if (runs.method == method).any()]
+    need(set(methods) - {"ppo"}, "runs of `baselines.py trpo` or `a2c` with n_envs 4")
+    groups = {name: runs[runs.method == name] for name in methods if name != "ppo"}
+    if len(methods) > 1:
+        shared = set.intersection(*(set(runs.beta[runs.method == name]) for name in methods))
+        groups["overall"] = analysis.same_protocol(runs[runs.beta.isin(shared)])
+    chosen = {}
+    for name, group in groups.items():
+        try:
+            chosen[name] = comparable(group, ["method", "beta"], ["environment"])
+        except Unusable:
+            continue
+    need(chosen, "an environment with all betas of a method")
+    fig, axes = panels(len(chosen), BETA, STANDARDIZED, width=3.2, height=2.8)
+    for ax, (name, group) in zip(axes, chosen.items(), strict=True):
+        group = group.assign(z=analysis.standardize(group))
+        for i, (method, part) in enumerate(group.groupby("method")):
+            table = analysis.cells_intervals(part, "z", "beta", ["environment"])
+            if name == "overall":
+                draw_intervals(ax, table.index + 0.03 * (i - 1), table, **METHOD_LOOK[method])
+            else:
+                draw_betas(ax, table)
+        betas = sorted(group.beta.unique())
+        labels = betas if len(betas) < 5 else [-1, 0, 0.5, 1, 2]
+        ax.set_xticks(labels, [f"{beta:g}" for beta in labels])
+        count = f"{group.environment.nunique()} environments, {len(group)} runs"
+        ax.set_title(f"{name if name == 'overall' else METHOD_NAMES[name]}\n{count}")
+    if "overall" in chosen:
+        legend_above(fig, *((METHOD_NAMES[name], METHOD_LOOK[name]) for name in methods))
+    return fig
+
+
+def gsde_vs_beta(runs):
+    """Sec. A13: gSDE, which has no beta, beside the betas of PPO with colored noise."""
+    need((runs.method == "gsde").any(), "runs of `baselines.py gsde`")
+    need(runs.beta.notna().any(), "runs with colored noise to compare gSDE with")
+    noise = runs.beta.fillna(np.inf)  # inf: gSDE
+    chosen = comparable(analysis.same_protocol(runs.assign(noise=noise)), ["noise"], CELL)
+    chosen = chosen.assign(z=analysis.standardize(chosen))
+    table = analysis.cells_intervals(chosen, "z", "noise", CELL)
+    betas, gsde = table.drop(np.inf), table.loc[[np.inf]]
+    fig, [ax] = panels(1, BETA_NAMED, STANDARDIZED, height=3)
+    x = betas.index.max() + 0.5
+    ax.axhspan(*gsde[["low", "high"]].iloc[0], color=INK, alpha=0.12, lw=0)
+    ax.axhline(gsde["mean"].iloc[0], color=INK, ls="--", lw=1)
+    draw_betas(ax, betas)
+    draw_intervals(ax, [x], gsde, color=INK, marker="h", ms=7)
+    ax.set_xticks([*betas.index, x], [*(f"{beta:g}" for beta in betas.index), "gSDE"])
+    ax.set_title(extent(chosen, runs))
+    return fig
+
+
 def complex_tasks(runs):
     """Sec. A8: performance per beta in each complex task."""
     runs = runs[runs.env_id.isin(COMPLEX)]
@@ -448,7 +512,7 @@ def make_all(todo, out):
     """Makes and writes figures (PNG, PDF) and tables (CSV, Markdown, LaTeX).
 
     todo: {name: (function, data, other arguments ...)}; data may be the name of an earlier table.
-    Returns the names of those made, and a line for each that could not be made.
+    Returns those made, by name, and a line for each that could not be made.
     """
     made, not_made = {}, []
     for name, (make, data, *rest) in tqdm(todo.items(), desc="tables and figures", unit=""):
@@ -466,7 +530,7 @@ def make_all(todo, out):
             made[name].savefig(out / f"{name}.png", dpi=200)
             made[name].savefig(out / f"{name}.pdf")
             plt.close(made[name])
-    return list(made), not_made
+    return made, not_made
 
 
 def noise(betas):
@@ -480,17 +544,24 @@ def noise(betas):
     }
 
 
-def results(runs, curves, betas=None):
-    """What `make_all` is to make of runs, from `select`, and their curves.
+def results(methods, curves, betas=None):
+    """What `make_all` is to make of runs, from `select_methods`, and their curves.
 
-    betas: to draw curves of, by default at most three.
+    Of the first method, but Sec. A7 and A13. betas: to draw curves of, by default at most three.
     """
+    runs = next(iter(methods.values()))
     grid, _ = analysis.main_grid(runs)
+    studied = {name: analysis.main_grid(each)[0] for name, each in methods.items()}
+    studied = {
+        name: each[~each.env_id.isin(COMPLEX) & ~each.vanilla] for name, each in studied.items()
+    }
     colored = grid[~grid.vanilla]
     study = colored[~colored.env_id.isin(COMPLEX)]  # what the paper averages over
     beyond = runs[~runs.env_id.isin(COMPLEX) & ~runs.vanilla]
-    same_epochs = beyond[beyond.n_epochs == grid.n_epochs.iloc[0]]
-    same_steps = beyond[beyond.n_steps == grid.n_steps.iloc[0]]
+    same_epochs = beyond[beyond.n_epochs.isin(grid.n_epochs[:1])]
+    same_steps = beyond[beyond.n_steps.isin(grid.n_steps[:1])]
+    three = pd.concat([each for name, each in studied.items() if name in METHOD_NAMES])
+    with_gsde = pd.concat([each for name, each in studied.items() if name in ("ppo", "gsde")])
     betas = betas or three_betas(colored)
     todo = {
         "best_beta_per_env": (analysis.best_beta_per_env, study),
@@ -505,7 +576,10 @@ def results(runs, curves, betas=None):
         "beta0_vs_vanilla": (beta0_vs_vanilla, grid[~grid.env_id.isin(COMPLEX)]),
         "n_envs_vs_n_steps": (n_envs_vs_n_steps, same_epochs),
         "n_epochs_vs_beta": (n_epochs_vs_beta, same_steps),
+        "transfer": (transfer, three[three.n_envs == 4]),
         "complex_tasks": (complex_tasks, colored),
+        "gsde_vs_beta": (gsde_vs_beta, with_gsde),
+        "coverage": (analysis.coverage, methods, curves),
         "final_return_vs_n_envs": (final_return_vs_n_envs, "final_returns", betas),
         "robust_performance": (robust_performance, "robust_statistics"),
     }
@@ -546,7 +620,14 @@ def draw_results(args):
     """The command `results`: makes all, removes what earlier data left there, reports the rest."""
     report = {}
     runs, curves = analysis.load(args.paths, args.env, args.beta, args.n_envs)
-    runs, report["left out"] = analysis.select(runs, args.method)
+    need(
+        args.method != "gsde",
+        "another --method: gSDE has no beta, and is drawn beside those of PPO",
+    )
+    methods, report["left out"] = analysis.select_methods(runs, args.method)
+    runs = next(iter(methods.values()))
+    others = [f"{name}: {len(each)} runs" for name, each in methods.items() if each is not runs]
+    report["of other methods, only where these are compared"] = others
     grid, dropped = analysis.main_grid(runs)
     report["only where n_steps or n_epochs vary, in no other figure or table"] = dropped
     parts = [part for _, part in grid.groupby(grid.env_id.isin(COMPLEX))]
@@ -557,11 +638,14 @@ def draw_results(args):
     betas = asked or three_betas(grid[~grid.vanilla])
     others = sorted(set(grid.beta.dropna()) - set(betas))
     report["not among the learning curves (--beta chooses)"] = [f"beta {b:g}" for b in others]
-    todo = results(runs, curves, betas)
+    todo = results(methods, curves, betas)
     args.out.mkdir(parents=True, exist_ok=True)
     file = args.out / "report.txt"
     earlier = file.read_text().partition("\n")[0] if file.exists() else ""
     made, report["not made"] = make_all(todo, args.out)
+    finals = made.get("final_returns")
+    outside = [] if finals is None else [analysis.outside(finals)[-1]]
+    report["final returns beside the published"] = outside
     if earlier.startswith("made: "):
         remove(args.out, set(earlier.removeprefix("made: ").split(", ")) - set(made))
     text = [f"made: {', '.join(made)}"]

@@ -24,6 +24,7 @@ TABLES = {
     "final_returns",
     "final_return_per_beta",
     "robust_statistics",
+    "coverage",
 }
 FIGURES = {
     "performance_vs_beta",
@@ -38,6 +39,8 @@ FIGURES |= {
     "final_return_vs_n_envs",
     "robust_performance",
     "learning_curves_n_envs_1",
+    "transfer",
+    "gsde_vs_beta",
 }
 FIGURES |= {"learning_curves_n_envs_2", "learning_curves_mountain_car"}
 
@@ -170,6 +173,14 @@ def sweep(tmp_path_factory):
     return root
 
 
+def other_methods(runs):
+    """The same runs as if of other methods, with n_envs 4, and one seed of gSDE."""
+    colored = runs[~runs.vanilla & (runs.n_epochs == 1) & (runs.n_steps == 16)]
+    four = colored[colored.n_envs == 2].assign(n_envs=4)
+    gsde = colored[(colored.beta == 0.5) & (colored.seed == 1)].assign(beta=np.nan, method="gsde")
+    return {"trpo": four.assign(method="trpo"), "a2c": four.assign(method="a2c"), "gsde": gsde}
+
+
 def check_ticks(fig, gap=2):
     """No two labels of an axis are nearer than `gap` points, nor do titles touch a neighbor's."""
     renderer = fig.canvas.get_renderer()
@@ -223,8 +234,9 @@ def test_every_figure_and_table_of_a_real_sweep(monkeypatch, tmp_path, sweep):
     runs, curves = analysis.load([sweep])
     runs, left_out = analysis.select(runs)
     assert left_out == []
+    methods = {"ppo": runs} | other_methods(runs)
     assert (
-        check_figures(monkeypatch, tmp_path, plot.results(runs, curves), FIGURES | TABLES)
+        check_figures(monkeypatch, tmp_path, plot.results(methods, curves), FIGURES | TABLES)
         == FIGURES
     )
     for name in TABLES:
@@ -238,7 +250,7 @@ def test_every_figure_and_table_of_a_real_sweep(monkeypatch, tmp_path, sweep):
     few, _ = analysis.main_grid(few)
     assert len(few) == 1
     (tmp_path / "few").mkdir()
-    made, not_made = plot.make_all(plot.results(few, curves), tmp_path / "few")
+    made, not_made = plot.make_all(plot.results({"ppo": few}, curves), tmp_path / "few")
     assert {"final_returns", "learning_curves_n_envs_2", "final_return_vs_n_envs"} <= set(made)
     assert [line.split(": needs ")[0] for line in not_made][:2] == [
         "performance_vs_beta",
@@ -280,7 +292,7 @@ def test_labels_of_the_whole_grid_do_not_touch(tmp_path):
         write_run(tmp_path, PENDULUM, 0.5, n, 1, [1.0] * 4, n_steps=n_steps, exp_name=f"n{n}")
     runs, curves = analysis.load([tmp_path])
     runs, _ = analysis.select(runs)
-    todo = plot.results(runs, curves)
+    todo = plot.results({"ppo": runs}, curves)
     names = ["performance_vs_beta", "performance_vs_n_envs", "n_envs_vs_n_steps"]
     names += ["n_envs_beta_grids", "final_return_vs_n_envs", "robust_performance"]
     made = {"final_returns": analysis.final_returns(runs[runs.n_steps == 2048])}
@@ -298,7 +310,7 @@ def test_three_betas_by_default_and_their_lines_carry_markers(tmp_path, run):
     runs, curves = analysis.load([tmp_path])
     runs, _ = analysis.select(runs)
     for betas, shown in ((None, [0, 0.5, 1]), ([-1.0, 2.0], [-1, 2])):
-        make, data, *rest = plot.results(runs, curves, betas)["learning_curves_n_envs_4"]
+        make, data, *rest = plot.results({"ppo": runs}, curves, betas)["learning_curves_n_envs_4"]
         fig = make(data, *rest)
         lines = [line for line in fig.axes[0].lines if len(line.get_xdata()) == 4]
         assert [line.get_marker() for line in lines] == [plot.look(b)["marker"] for b in shown]
@@ -379,7 +391,7 @@ def test_vanilla_alone(tmp_path, run):
         "plot.py results", tmp_path / "runs", "--beta", "vanilla", "--out", out
     )
     assert code == 0, stderr
-    assert stdout.startswith(f"{out}: final_returns, final_return_per_beta\n")
+    assert stdout.startswith(f"{out}: final_returns, final_return_per_beta, coverage\n")
     report = (out / "report.txt").read_text()
     assert "final_return_vs_n_envs: needs runs with colored noise" in report
 
@@ -394,7 +406,7 @@ def test_the_report_names_what_is_dropped_and_mixed(tmp_path, run):
     for text in (stdout, (out / "report.txt").read_text()):
         assert "Mountain Car: --n-steps 4096 --n-epochs 10, not (2048, 10)" in text
         assert "--eval-episodes 10 (1 runs) and --eval-episodes 50 (1 runs)" in text
-        assert "another method, trpo" in text
+        assert "only where these are compared: 1\n  trpo: 1 runs" in text
     assert run("plot.py results", tmp_path / "runs", "--method", "trpo", "--out", out)[0] == 0
 
 
@@ -417,3 +429,74 @@ def test_the_environments_picture(monkeypatch):
         picture = ax.images[0].get_window_extent()
         assert ax.title.get_window_extent().y0 >= picture.y1
     plt.close(fig)
+
+
+@pytest.mark.filterwarnings("error")
+def test_other_methods_beside_ppo(tmp_path, run, monkeypatch):
+    """Panels of TRPO and A2C are standardized by themselves, the third over all methods."""
+    for i, method in enumerate(("ppo", "trpo", "a2c", "gsde")):
+        for beta in (0, 0.5) if method != "gsde" else (0.5,):
+            for seed in (1, 2):
+                more = {"method": method, "exp_name": method}
+                write_run(tmp_path, CAR, beta, 4, seed, [10 * i + beta + 0.01 * seed], **more)
+    methods, _ = analysis.select_methods(analysis.load([tmp_path])[0])
+    three = pd.concat([methods[name] for name in ("ppo", "trpo", "a2c")])
+    fig = plot.transfer(three)
+    trpo, a2c, overall = fig.axes
+    for ax in (trpo, a2c):
+        assert ax.lines[0].get_ydata() == pytest.approx([-1, 1], abs=0.01)
+    z = analysis.standardize(three).groupby([three.method, three.beta]).mean()
+    for line, method in zip(overall.lines, ("a2c", "ppo", "trpo"), strict=True):
+        assert line.get_ydata() == pytest.approx(z[method].to_numpy())
+        assert line.get_color() == plot.METHOD_LOOK[method]["color"]
+    assert trpo.get_title().startswith("TRPO") and a2c.get_title().startswith("A2C")
+    plt.close(fig)
+    both = pd.concat([methods["ppo"], methods["gsde"]])
+    fig = plot.gsde_vs_beta(both)
+    assert fig.axes[0].get_xticklabels()[-1].get_text() == "gSDE"
+    z = analysis.standardize(both)[both.method == "gsde"].mean()
+    assert fig.axes[0].lines[0].get_ydata() == pytest.approx([z, z])
+    plt.close(fig)
+    # A user's command: all of it, what lacks said, and never an average over methods
+    out = tmp_path / "figures"
+    _, stdout, _ = run("plot.py results", tmp_path, "--out", out)
+    made = stdout.splitlines()[0].partition(": ")[2].split(", ")
+    assert {"transfer", "gsde_vs_beta", "coverage"} <= set(made)
+    title = "of other methods, only where these are compared: 3"
+    assert f"{title}\n  trpo: 4 runs\n  a2c: 4 runs\n  gsde: 2 runs\n" in stdout
+    assert "final returns beside the published: 1\n  0 of 0 published means outside" in stdout
+    table = pd.read_csv(out / "final_returns.csv")
+    assert table["mean"].tolist() == pytest.approx([0.015, 0.515])
+    _, stdout, _ = run("plot.py results", tmp_path / "ppo", "--out", out)
+    assert "transfer: needs runs of `baselines.py trpo` or `a2c` with n_envs 4" in stdout
+    assert "gsde_vs_beta: needs runs of `baselines.py gsde`" in stdout
+    # Without PPO's runs there is panel (a); another protocol is not compared
+    code, stdout, stderr = run("plot.py results", tmp_path / "trpo", "--out", out)
+    assert code == 0 and stdout.startswith(f"{out}: transfer, coverage\n"), stderr
+    code, _, stderr = run("plot.py results", tmp_path, "--method", "gsde", "--out", out)
+    assert code == 1 and "gSDE has no beta" in stderr
+    with pytest.raises(analysis.Unusable, match="same protocol"):
+        plot.transfer(three.assign(gamma=np.where(three.method == "trpo", 0.9, 0.99)))
+
+
+def test_the_coverage_of_the_measured_results(tmp_path, run):
+    """Each row of the table names a command that is there, and a file or figure it makes."""
+    out = tmp_path / "figures"
+    assert run("plot.py results", ROOT / "results" / "reproduction.csv", "--out", out)[0] == 0
+    table = pd.read_csv(out / "coverage.csv").fillna("")
+    assert set(table.verdict) <= {"holds", "does not", "open", ""}
+    assert table.runs.str.fullmatch(r"\d+ of \d+|none needed").all()
+    presets = set(" ".join(table.command).replace(";", "").split("run_sweep.sh "))
+    presets = {command.split()[0] for command in presets if "python plot.py results" in command}
+    help_text = (ROOT / "run_sweep.sh").read_text()
+    known = plot.results(dict(ppo=select(ROOT / "results" / "reproduction.csv")), None)
+    known = {*known, *NOISE, "results/environments.png", "learning_curves_n_envs_*"}
+    known |= {"learning_curves_mountain_car"}
+    assert set(table.file) <= known
+    for preset in presets:
+        assert f"#   {preset} " in help_text, preset
+    said = table.set_index("says")
+    assert (
+        said.runs["beta 0.5 is best on average"]
+        == f"{len(select(ROOT / 'results' / 'reproduction.csv'))} of 20480"
+    )
