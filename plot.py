@@ -24,6 +24,7 @@ from scipy import stats
 from tqdm import tqdm
 
 import analysis
+import claims
 from analysis import CELL, STUDY_BETAS, Unusable, beta_text, comparable, need
 from colored_noise import autocovariance, colored_noise, expected_psd, marginal_variance, mean_std
 from environments import COMPLEX, NAMES, make_render_env, silence
@@ -579,7 +580,7 @@ def results(methods, curves, betas=None):
         "transfer": (transfer, three[three.n_envs == 4]),
         "complex_tasks": (complex_tasks, colored),
         "gsde_vs_beta": (gsde_vs_beta, with_gsde),
-        "coverage": (analysis.coverage, methods, curves),
+        "coverage": (claims.coverage, methods, curves),
         "final_return_vs_n_envs": (final_return_vs_n_envs, "final_returns", betas),
         "robust_performance": (robust_performance, "robust_statistics"),
     }
@@ -644,7 +645,7 @@ def draw_results(args):
     earlier = file.read_text().partition("\n")[0] if file.exists() else ""
     made, report["not made"] = make_all(todo, args.out)
     finals = made.get("final_returns")
-    outside = [] if finals is None else [analysis.outside(finals)[-1]]
+    outside = [] if finals is None else [claims.outside(finals)[-1]]
     report["final returns beside the published"] = outside
     if earlier.startswith("made: "):
         remove(args.out, set(earlier.removeprefix("made: ").split(", ")) - set(made))

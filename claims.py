@@ -1,0 +1,577 @@
+"""What the paper claims, and what our runs say about it: holds, does not, or open.
+
+`coverage` makes the table of all figures, tables and claims of "Colored Noise in PPO" (AAAI 2024)
+that `python plot.py results` writes; `outside` counts published means that our intervals miss.
+"""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from analysis import (
+    AXES,
+    CELL,
+    SHARED,
+    STUDY,
+    STUDY_BETAS,
+    STUDY_N_ENVS,
+    Unusable,
+    best_beta_per_env,
+    comparable,
+    differences,
+    final_returns,
+    main_grid,
+    need,
+    projected_ranks,
+    standardize,
+    value_text,
+)
+from colored_noise import autocovariance, mean_std
+from environments import COMPLEX, NAMES
+
+# Chance that the 95 % BCa interval of so many seeds misses the mean of 20 others, as the published
+# means are: 4000 normal samples each, numpy's generator with seed 0; interpolated in between. The
+# true mean it misses with chance 0.28, 0.16, 0.09 and 0.06 for 3, 5, 10 and 20 seeds, not 0.05.
+MISSES = {2: 0.507, 3: 0.302, 4: 0.240, 5: 0.191, 6: 0.186, 10: 0.164, 20: 0.176}
+MARGIN = 0.25  # standard deviations of performance within which two are the same
+NONE = "no runs that can be compared"
+RARE = 0.1  # share of runs below which something never happens
+
+
+def outside(table):
+    """How many published means our intervals miss, how many chance would, and a line that says so.
+
+    table: of `final_returns`. Only cells with an interval and a published mean count.
+    """
+    known = table[table.in_interval.isin(["yes", "no"])]
+    missed = int((known.in_interval == "no").sum())
+    chance = np.interp(known.runs.to_numpy(float), list(MISSES), list(MISSES.values())).sum()
+    seeds = [f"{cells} of {n} seeds" for n, cells in known.runs.value_counts().sort_index().items()]
+    line = f"{missed} of {len(known)} published means outside our 95 % intervals, "
+    line += f"{chance:.1f} expected by chance ({', '.join(seeds) or 'no cells'})"
+    return missed, chance, line
+
+
+def contrast(runs, weights, by, cells=("environment",), of=16):
+    """A weighted sum of groups' means of `z`, averaged over cells and environments, and its error.
+
+    In each cell with all groups: the sum of weight times mean over seeds; only where each has two
+    seeds, if such cells are there. Its mean over an environment's cells is averaged over
+    environments. Their E are taken for a sample of `of`, the
+    seeds for a sample of each (Cochran, Sampling Techniques, Sec. 10.3): with f = E / of the
+    variance is (1 - f) s^2 / E between environments + f / E times the mean variance by seeds. So
+    16 of 16 are the study itself, where only seeds are chance. Degrees of freedom: Satterthwaite.
+
+    weights: {value of the column `by`: weight}. cells: columns, `environment` first.
+
+    Returns a dict: environments, and where there are any: mean; se, NaN where a group has one seed;
+    df; made_of, in words; enough: whether it is of half of the environments, and of three values of
+    the second column of cells, if any, that half of the environments have.
+    """
+    weight = pd.Series(weights, dtype=float)
+    groups = runs[runs[by].isin(list(weights))].groupby([*cells, by]).z
+    nothing = {"environments": 0}
+    if groups.ngroups == 0:
+        return nothing
+    each = [groups.agg(how).unstack(by).reindex(columns=weight.index) for how in ("mean", "var")]
+    each.append(groups.size().unstack(by).reindex(columns=weight.index))
+    there, two = each[0].notna().all(axis=1), each[1].notna().all(axis=1)
+    mean, variance, seeds = (table[two if two.any() else there] for table in each)
+    if mean.empty:
+        return nothing
+    environments = mean.index.get_level_values("environment")
+    by_environment = (mean * weight).sum(axis=1).groupby(environments).mean()
+    n, n_cells = len(by_environment), environments.value_counts()[environments].to_numpy()
+    f = min(n / of, 1)
+    within = f * (variance * weight**2 / seeds).div((n_cells * n) ** 2, axis=0).to_numpy()
+    between = (1 - f) * by_environment.var() / n if f < 1 else 0.0
+    total, squares = within.sum() + between, (within**2 / (seeds - 1).clip(lower=1)).to_numpy()
+    squares = squares.sum() + (between**2 / (n - 1) if between else 0)
+    enough, made_of = n >= of / 2, f"{n} environment{'s'[: n > 1]}"
+    if len(cells) > 1:
+        values = mean.groupby(level=1).size()
+        enough &= (values >= of / 2).sum() >= 3
+        made_of += f", {cells[1]} {', '.join(f'{value:g}' for value in values.index)}"
+    df = total**2 / squares if squares != 0 else np.inf
+    found = {"mean": by_environment.mean(), "se": total**0.5, "df": df}
+    return found | {"environments": n, "enough": bool(enough), "made_of": made_of}
+
+
+def interval(found, alpha=0.05):
+    """Low and high end of the 1 - alpha interval of a `contrast`; NaN where it has none."""
+    half = stats.t.ppf(1 - alpha / 2, found["df"]) * found["se"] if found["se"] else 0.0
+    return found["mean"] - half, found["mean"] + half
+
+
+def words(what, found):
+    low, high = interval(found)
+    text = f"{what} {found['mean']:z.2f}"
+    text += ", no interval" if np.isnan(low) else f" [{low:z.2f}, {high:z.2f}]"
+    return f"{text} ({found['made_of']}{'' if found['enough'] else ': too few'})"
+
+
+def judge(low, high, least=0.0, most=np.inf):
+    """Verdict on "it is between least and most" by an interval: see `coverage`."""
+    if low > least and high < most:
+        return "holds"
+    return "does not" if high < least or low > most else "open"
+
+
+def positive(runs, what, *arguments, **more):
+    """Verdict on a contrast that the claim says is positive."""
+    found = contrast(runs, *arguments, **more)
+    if not found["environments"]:
+        return "open", NONE
+    return judge(*interval(found)) if found["enough"] else "open", words(what, found)
+
+
+def same(runs, weights, by, **more):
+    """Verdict on contrasts that the claim says are none. weights: a dict for each."""
+    claims = []
+    for each in weights:
+        found = contrast(runs, each, by, **more)
+        if not found["environments"]:
+            return "open", NONE
+        verdict = judge(*interval(found), -MARGIN, MARGIN) if found["enough"] else "open"
+        claims.append((verdict, words("difference", found)))
+    return both(*claims)
+
+
+def both(*claims):
+    """All claims (verdict, text) hold, or one does not, or it is open."""
+    verdicts = {verdict for verdict, _ in claims}
+    text = "; ".join(dict.fromkeys(text for _, text in claims))
+    if "does not" in verdicts:
+        return "does not", text
+    return "holds" if verdicts == {"holds"} else "open", text
+
+
+def best(runs, winner, rivals, by, **more):
+    """Verdict on "winner has the highest mean": ahead of every rival, all of them there.
+
+    It does not where it is behind one, by an interval as wide as the number of rivals asks for.
+    """
+    leads = {rival: contrast(runs, {winner: 1, rival: -1}, by, **more) for rival in rivals}
+    leads = {rival: found for rival, found in leads.items() if found["environments"]}
+    if not leads:
+        return "open", NONE
+    second = min(leads, key=lambda rival: leads[rival]["mean"])
+    enough = [found for found in leads.values() if found["enough"]]
+    verdict = "open"
+    if any(interval(found, 0.05 / len(leads))[1] < 0 for found in enough):
+        verdict = "does not"
+    elif len(enough) == len(rivals) and all(interval(found)[0] > 0 for found in enough):
+        verdict = "holds"
+    there = f" (of {len(leads)} of {len(rivals)} rivals)" * (len(leads) < len(rivals))
+    what = f"lead of {value_text(winner)} over the next, {value_text(second)}{there}:"
+    return verdict, words(what, leads[second])
+
+
+def color_matters(runs):
+    """Some beta does better than some other, all pairs tested; the widest apart is shown."""
+    pairs = list(itertools.permutations(sorted(runs.beta.unique()), 2))
+    found = {pair: contrast(runs, {pair[0]: 1, pair[1]: -1}, "beta", CELL) for pair in pairs}
+    found = {pair: each for pair, each in found.items() if each["environments"]}
+    if not found:
+        return "open", NONE
+    apart = [each["enough"] and interval(each, 0.1 / len(pairs))[0] > 0 for each in found.values()]
+    first, second = max(found, key=lambda pair: (found[pair]["enough"], found[pair]["mean"]))
+    text = words(f"{first:g} over {second:g}", found[first, second])
+    return ("holds" if any(apart) else "open"), text
+
+
+def best_beta_varies(runs):
+    """In one environment pink noise does better than white, in another worse, of all tested."""
+    leads = {}
+    for environment, group in runs.groupby("environment"):
+        found = contrast(group, {1.0: 1, 0.0: -1}, "beta", CELL, of=1)
+        if found["environments"]:
+            leads[environment] = interval(found, 0.05 / runs.environment.nunique())
+    ahead = sum(low > 0 for low, _ in leads.values())
+    behind = sum(high < 0 for _, high in leads.values())
+    text = f"beta 1 ahead of 0 in {ahead}, behind in {behind} of {len(leads)} environments"
+    return ("holds" if ahead and behind else "open"), text
+
+
+def comparable_counts(runs, draws=300):
+    """Table 1: beta 0.5 is comparable with the best in more environments than 0 and 1 are.
+
+    How often a test finds a difference depends on the number of seeds, so the counts, 11, 8 and 7
+    of 16, are not compared, but their order is: by seeds drawn anew within cells, in all 16
+    environments with at least three n_envs.
+    """
+    rng, betas, counts = np.random.default_rng(0), (0.5, 0.0, 1.0), np.zeros((draws, 3), int)
+    table = best_beta_per_env(runs).iloc[-1]
+    text = ", ".join(f"{beta:g}: {table[f'beta_{beta}']}" for beta in betas)
+    text = f"comparable with the best {text} environments (paper 11, 8, 7 of 16)"
+    for _, group in runs.groupby("environment"):
+        cells = group.groupby(["beta", "n_envs"]).performance.apply(np.array).unstack()
+        cells = cells.dropna(axis=1)
+        cells = cells.loc[:, cells.map(len).min() > 1]
+        if cells.shape[1] < 3 or not {*betas} <= {*cells.index} or runs.environment.nunique() < 16:
+            return "open", text
+        sides = []
+        for samples in cells.to_numpy():  # each beta's (n_envs, seeds)
+            x = [s[rng.integers(len(s), size=(draws, len(s)))] for s in samples]
+            x, w = np.hstack(x), np.repeat([1 / len(s) for s in samples], [len(s) for s in samples])
+            w = w / w.sum()
+            variance = (w * (x - (x @ w)[:, None]) ** 2).sum(1) / (1 - (w**2).sum())
+            sides.append([x @ w, variance**0.5, np.full(draws, 1 / (w**2).sum())])
+        sides = np.array(sides)  # (betas, 3, draws)
+        leader = sides[sides[:, 0].argmax(0), :, np.arange(draws)].T
+        for i, beta in enumerate(betas):
+            side = sides[cells.index.get_loc(beta)]
+            with np.errstate(all="ignore"):
+                p = stats.ttest_ind_from_stats(*leader, *side, equal_var=False).pvalue
+            counts[:, i] += ~(p < 0.05) | (leader[0] == side[0])
+    more = counts[:, :1] - counts[:, 1:]
+    ends = np.percentile(more, [2.5, 97.5], axis=0).T
+    return both(*((judge(*each), "") for each in ends))[0], text
+
+
+def drawn_grids(runs, draws=1000):
+    """Sec. "[...] Interact": standardized performance by beta and n_envs, drawn anew.
+
+    Environments, unless all 16 are there, and seeds within cells, one less than there are, which
+    makes the variance right (Rao and Wu 1988). Of the betas and n_envs that half of the
+    environments have. Returns the grid, (betas, n_envs), and the draws, (draws, betas, n_envs).
+    """
+    runs = runs[runs.groupby(["environment", "beta", "n_envs"]).z.transform("size") > 1]
+    there = runs.groupby(["beta", "n_envs"]).environment.transform("nunique")
+    need((there >= 8).any(), "two seeds in eight environments")
+    runs = comparable(runs[there >= 8], ["beta", "n_envs"], ["environment"])
+    cells = runs.groupby(["environment", "beta", "n_envs"]).z.apply(np.array)
+    E, grid = runs.environment.nunique(), cells.map(np.mean).groupby(level=[1, 2]).mean().unstack()
+    need(grid.notna().all(axis=None) and min(grid.shape) > 2, "three betas at each of three n_envs")
+    need(E >= 8, "eight environments with all betas and n_envs that eight have")
+    rng = np.random.default_rng(0)
+    z = [x[rng.integers(len(x), size=(draws, len(x) - 1))].mean(1) for x in cells]
+    z = np.array(z).reshape(E, -1, draws)
+    if E < 16:
+        z = z[rng.integers(E, size=(E - 1, draws)), :, np.arange(draws)].transpose(0, 2, 1)
+    return grid, z.mean(0).T.reshape(draws, *grid.shape)
+
+
+def larger_n_envs_larger_beta(runs):
+    """The best beta's slope over log2 n_envs is positive."""
+    grid, drawn = drawn_grids(runs)
+    x = np.log2(grid.columns.to_numpy())
+    x = x - x.mean()
+    slope = grid.idxmax().to_numpy() @ x / (x**2).sum()
+    ends = np.percentile(grid.index.to_numpy()[drawn.argmax(1)] @ x / (x**2).sum(), [2.5, 97.5])
+    found = ", ".join(f"{n}: {beta:g}" for n, beta in grid.idxmax().items())
+    text = (
+        f"best beta per doubling {slope:z.2f} [{ends[0]:z.2f}, {ends[1]:z.2f}]; at n_envs {found}"
+    )
+    return judge(*ends), text
+
+
+def ranks_as_projected(runs):
+    """Sec. "Why Do Larger beta Work Better": rank correlation with the ranks projected."""
+    grid, drawn = drawn_grids(runs)
+    projected = projected_ranks(grid.idxmax(), grid.index, grid.columns).to_numpy()
+
+    def correlation(grids):  # mean over n_envs of Spearman's, over the last two axes
+        a, b = stats.rankdata(-grids, axis=-2), projected
+        a, b = a - a.mean(-2, keepdims=True), b - b.mean(-2, keepdims=True)
+        norm = np.sqrt((a**2).sum(-2) * (b**2).sum(-2))
+        return ((a * b).sum(-2) / norm).mean(-1)
+
+    ends = np.percentile(correlation(drawn), [2.5, 97.5])
+    text = f"rank correlation {correlation(grid.to_numpy()):z.2f} [{ends[0]:z.2f}, {ends[1]:z.2f}]"
+    return judge(*ends), text
+
+
+def more_n_envs_worse(runs):
+    """The slope of performance over log2 n_envs, from 4 on, is negative."""
+    there = runs.groupby("n_envs").environment.nunique()
+    n = there.index[(there >= 8) & (there.index >= 4)].to_numpy()
+    if len(n) < 2:
+        return "open", NONE
+    x = np.log2(n) - np.log2(n).mean()
+    weights = dict(zip(n, -x / (x**2).sum(), strict=True))
+    return positive(runs, "loss per doubling", weights, "n_envs", ["environment", "beta"])
+
+
+def pink_gains_with_n_envs(runs):
+    """Sec. A10: beta 1's lead over the mean of 0 and 0.5 has a positive slope over log2 n_envs."""
+    x = np.array([0, 2, 5]) - 7 / 3
+    by_beta = {0.0: -0.5, 0.5: -0.5, 1.0: 1.0}
+    weights = {
+        f"{beta:g} {n}": share * slope
+        for beta, share in by_beta.items()
+        for n, slope in zip((1, 4, 32), x / (x**2).sum(), strict=True)
+    }
+    cell = runs.beta.map("{:g}".format) + " " + runs.n_envs.astype(str)
+    return positive(runs.assign(cell=cell), "gain per doubling", weights, "cell")
+
+
+def never_found(runs):
+    """The goal gives 100, and all else costs: a run has found it if it ends above 0."""
+    count, n = int((runs.final_return > 0).sum()), len(runs)
+    high = stats.binomtest(count, n).proportion_ci().high
+    verdict = "does not" if count else judge(0, high, -1, RARE)
+    return verdict, f"found at the end by {count} of {n} runs, share at most {high:.2f}"
+
+
+def no_collapse(runs):
+    """Fewer than RARE of the runs end below half of what they had gained.
+
+    Of means over a tenth of the evaluations: the last one's, the best, and the first.
+    """
+    lost = (runs["last"] < (runs["first"] + runs["top"]) / 2).astype(float)
+    found = contrast(runs.assign(z=lost, every=1), {1: 1}, "every")
+    low, high = interval(found)
+    low, high = (
+        max(low, 0),
+        max(high, stats.binomtest(int(lost.sum()), len(lost)).proportion_ci().high),
+    )
+    verdict = judge(low, high, -1, RARE) if found["enough"] else "open"
+    return verdict, f"half lost by {lost.sum():g} of {len(lost)} runs, share at most {high:.2f}"
+
+
+def less_in_a2c(runs):
+    """Each method's performance is standardized by itself."""
+    z = pd.concat([standardize(group) for _, group in runs.groupby("method")])
+    cell = runs.method + runs.beta.map(" {:g}".format)
+    weights = {"trpo 0.5": 1, "trpo 0": -1, "a2c 0.5": -1, "a2c 0": 1}
+    return positive(runs.assign(z=z, cell=cell), "lead in TRPO less that in A2C", weights, "cell")
+
+
+def a2c_learns_less(runs):
+    cells = ["environment", "beta"]
+    few = runs.groupby("method").beta.nunique().min()
+    cells = cells if few > 2 else ["environment"]
+    weights = {name: {name: 1, "a2c": -1} for name in ("ppo", "trpo")}
+    found = [positive(runs, f"{name} over a2c", w, "method", cells) for name, w in weights.items()]
+    return both(*found)
+
+
+def published_final_returns(runs):
+    """More published means outside than chance would have in 97.5 % of cases: does not."""
+    table = final_returns(runs.assign(z=0))
+    missed, chance, line = outside(table)
+    n = int(table.in_interval.isin(["yes", "no"]).sum())
+    return ("does not" if n and missed > stats.binom.ppf(0.975, n, chance / n) else "open"), line
+
+
+def noise_is_correlated():
+    """Closed forms; the marginals are Gaussian by construction, as sums of Gaussians."""
+    lags = [autocovariance(beta, 1000) for beta in STUDY_BETAS]
+    two_step = np.array([float(lag[1] / lag[0]) for lag in lags])
+    rises = (np.diff(two_step) > 0).all() and (two_step[np.array(STUDY_BETAS) > 0] > 0).all()
+    text = ", ".join(f"{b:g}: {r:z.2f}" for b, r in zip(STUDY_BETAS, two_step, strict=True))
+    return ("holds" if rises else "does not"), f"two-step correlation at beta {text}"
+
+
+def bias_spreads():
+    std = mean_std(np.array(STUDY_BETAS, float), 1000).numpy()
+    text = ", ".join(f"{b:g}: {s:.2f}" for b, s in zip(STUDY_BETAS, std, strict=True))
+    verdict = "holds" if (np.diff(std) > 0).all() else "does not"
+    return verdict, f"standard deviation of a sequence's mean at beta {text}"
+
+
+def claim_runs(methods, curves):
+    """The runs that each claim is about, of the study's protocol: {name: (runs, how many in all)}.
+
+    methods, curves: of `select_methods` and `load`. Adds `z`, standardized performance, within each
+    environment over the runs of that name; `noise`, text of beta or "gsde"; and `first`, `top` and
+    `last` of `no_collapse`.
+    """
+    kept = []
+    for name, runs in methods.items():
+        own = SHARED if name in ("trpo", "a2c") else set(STUDY) - {"method", "n_steps", "n_epochs"}
+        runs = runs if name == "ppo" else main_grid(runs)[0]
+        kept.append(runs[(differences(runs, own) == "") & runs.env_id.isin(list(NAMES))])
+    runs = pd.concat(kept)
+    returns = curves.loc[runs.index].dropna(axis=1, how="all")
+    returns = returns.T.rolling(max(1, returns.shape[1] // 10)).mean().dropna().T
+    if returns.shape[1]:
+        ends = {
+            "first": returns.iloc[:, 0],
+            "top": returns.max(axis=1),
+            "last": returns.iloc[:, -1],
+        }
+        runs = runs.assign(**ends)
+    runs = runs.assign(noise=runs.beta.map("{:g}".format).where(runs.method != "gsde", "gsde"))
+    hard, four = runs.env_id.isin(COMPLEX), runs.n_envs == 4
+    ppo = (runs.method == "ppo") & runs.n_envs.isin(STUDY_N_ENVS)
+    usual = ppo & (runs.n_steps == 2048) & (runs.n_epochs == 10)
+    colors = runs.beta.isin(STUDY_BETAS) & ~runs.vanilla
+    main, white = usual & colors & ~hard, usual & ~hard & (runs.vanilla | (runs.beta == 0))
+    three = main & runs.beta.isin([0, 0.5, 1]) & runs.n_envs.isin([1, 4, 32])
+    trpo, a2c = ((runs.method == name) & four & colors & ~hard for name in ("trpo", "a2c"))
+    few = runs.beta.isin([0.2, 0.5, 0.75]) & runs.n_epochs.isin([5, 10, 20])
+    size = ppo & colors & (runs.beta == 0.5) & (runs.n_epochs == 10) & runs.n_envs.isin([2, 4, 8])
+    chosen = {
+        "main": (main, 20480),
+        "all": (usual & ~hard & (colors | runs.vanilla), 23040),
+        "vanilla": (white, 5120),
+        "car": (white & (runs.environment == "Mountain Car"), 320),
+        "trpo": (trpo, 2560),
+        "a2c": (a2c, 2560),
+        "both": (trpo | a2c, 5120),
+        "methods": (trpo | a2c | main & four, 7680),
+        "complex": (usual & colors & hard & four, 640),
+        "n_envs 4": (main & four, 2560),
+        "pendulum": (three & (runs.environment == "Pendulum Swingup"), 180),
+        "three": (three, 2880),
+        "n_steps": (size & ~hard & (runs.n_envs * runs.n_steps == 8192), 960),
+        "n_epochs": (ppo & colors & few & ~hard & four & (runs.n_steps == 2048), 2880),
+        "gsde": (main | (runs.method == "gsde") & runs.n_envs.isin(STUDY_N_ENVS) & ~hard, 23040),
+    }
+    parts = {name: (runs[mask], total) for name, (mask, total) in chosen.items()}
+    return {name: (part.assign(z=standardize(part)), n) for name, (part, n) in parts.items()}
+
+
+def coverage(methods, curves):
+    """Every figure, table and claim of the paper: what makes it, how much is here, what that says.
+
+    A claim "holds" only where a 95 % interval excludes the contrary, and "does not" only where it
+    excludes the claim; else it is "open", and always with one seed, with less than half of the
+    environments it is about, or, where it averages over n_envs or betas, less than three of them.
+    That two are the same means that they differ by less than MARGIN; never, in less than RARE of
+    runs. The environments that are here count as a sample of the paper's, see `contrast`, though
+    it may be the cheap ones. Only runs of the study's protocol count, 20 seeds a cell at most.
+    """
+    parts = claim_runs(methods, curves)
+    betas, sizes = STUDY_BETAS, STUDY_N_ENVS
+
+    def others(values, *without):
+        return [value for value in values if value not in without]
+
+    def lead(runs, cells=("environment",)):
+        return positive(runs, "lead of 0.5 over 0", {0.5: 1, 0.0: -1}, "beta", cells)
+
+    def best_configuration(runs):
+        cell = runs.beta.map("{:g}, ".format) + runs.n_envs.astype(str)
+        rivals = [f"{beta:g}, {n}" for beta in betas for n in sizes if (beta, n) != (0.5, 4)]
+        return best(runs.assign(cell=cell), "0.5, 4", rivals, "cell")
+
+    def two_and_four_best(runs):
+        rest, cells = others(sizes, 2, 4), ["environment", "beta"]
+        return both(*(best(runs, n, rest, "n_envs", cells=cells) for n in (2, 4)))
+
+    def pendulum(runs):
+        wanted = ((1, 0), (4, 0.5), (32, 1))
+        found = [(n, runs[runs.n_envs == n], beta) for n, beta in wanted]
+        claims = [best(at, b, others([0, 0.5, 1], b), "beta", of=1) for _, at, b in found]
+        named = [(v, f"n_envs {n}: {t}") for (v, t), (n, *_) in zip(claims, found, strict=True)]
+        return both(*named)
+
+    def same_update_size(runs):
+        pairs = ((4096, 2048), (1024, 2048), (4096, 1024))
+        return same(runs, [{a: 1, b: -1} for a, b in pairs], "n_steps")
+
+    def same_preference(runs):
+        cell = runs.beta.map("{:g} ".format) + runs.n_epochs.astype(str)
+        share = {"0.5": 1, "0.2": -0.5, "0.75": -0.5}
+        pairs = [{5: 1, 10: -1}, {20: 1, 10: -1}]
+        pairs = [{f"{b} {n}": x * y for b, x in share.items() for n, y in p.items()} for p in pairs]
+        return same(runs.assign(cell=cell), pairs, "cell")
+
+    def fewer_epochs_worse(runs):
+        cells = ["environment", "beta"]
+        return positive(runs, "10 epochs over 5", {10: 1, 5: -1}, "n_epochs", cells)
+
+    def like_red(runs):
+        return same(runs, [{"gsde": 1, "1.25": -0.5, "2": -0.5}], "noise", cells=CELL)
+
+    def beta0_is_vanilla(runs):
+        return same(runs, [{True: 1, False: -1}], "vanilla", cells=CELL)
+
+    # fmt: off
+    rows = [  # where, what it shows or says, preset, file, runs, test
+        ("Fig. 1", "random walks", "noise", "noise_random_walks", None, None),
+        ("Sec. Colored Noise", "expected PSD", "noise", "noise_psd", None, None),
+        ("Fig. 2", "the environments", "environments", "results/environments.png", None, None),
+        ("Fig. 3", "the color of the noise affects performance", "main", "performance_vs_beta",
+         "main", color_matters),
+        ("Fig. 3", "beta 0.5 outperforms white noise", "main", "performance_vs_beta", "main",
+         lambda runs: lead(runs, CELL)),
+        ("Fig. 3, conclusion i", "beta 0.5 is best on average", "main", "performance_vs_beta",
+         "main", lambda runs: best(runs, 0.5, others(betas, 0.5), "beta", cells=CELL)),
+        ("Table 1", "the best beta depends on the environment", "main", "best_beta_per_env", "main",
+         best_beta_varies),
+        ("Table 1, conclusion ii", "0.5, 0, 1 comparable with the best in 11, 8, 7 of 16: "
+         "in most for 0.5", "main", "best_beta_per_env", "main", comparable_counts),
+        ("Fig. 4, conclusion iii", "n_envs 4 is best on average", "main", "performance_vs_n_envs",
+         "main", lambda runs: best(runs, 4, others(sizes, 4), "n_envs",
+                                   cells=["environment", "beta"])),
+        ("Conclusion iii", "n_envs 2 and 4 outperform all others", "main", "performance_vs_n_envs",
+         "main", two_and_four_best),
+        ("Fig. 4", "more environments than 4 do worse", "main", "performance_vs_n_envs", "main",
+         more_n_envs_worse),
+        ("Fig. 5, conclusion iv", "larger n_envs wants larger beta", "main", "n_envs_beta_grids",
+         "main", larger_n_envs_larger_beta),
+        ("Fig. 5", "beta 0.5 with n_envs 4 is the best configuration", "main", "n_envs_beta_grids",
+         "main", best_configuration),
+        ("Fig. 6", "a sequence's mean spreads more with larger beta", "noise", "noise_bias", None,
+         bias_spreads),
+        ("Fig. 7, conclusion v", "ranks follow those projected from the bias", "main",
+         "n_envs_beta_grids", "main", ranks_as_projected),
+        ("Fig. A1", "subsequent steps are correlated where beta > 0, more with larger beta",
+         "noise", "noise_two_step", None, noise_is_correlated),
+        ("Fig. A1", "each step is Gaussian", "noise", "noise_marginal", None, None),
+        ("Table A2", "best beta per n_envs", "main", "best_beta_per_n_envs", "main", None),
+        ("Fig. A6", "beta 0 matches vanilla PPO", "main, vanilla", "beta0_vs_vanilla", "vanilla",
+         beta0_is_vanilla),
+        ("Fig. A7a", "beta 0.5 improves TRPO", "transfer", "transfer", "trpo", lead),
+        ("Fig. A7b", "beta 0.5 improves A2C", "transfer", "transfer", "a2c", lead),
+        ("Fig. A7", "the effect is less in A2C", "transfer", "transfer", "both", less_in_a2c),
+        ("Fig. A7c", "A2C learns less than PPO and TRPO", "main, transfer", "transfer", "methods",
+         a2c_learns_less),
+        ("Fig. A8", "beta 0.5 is favored in complex tasks", "complex", "complex_tasks", "complex",
+         lambda runs: best(runs, 0.5, others(betas, 0.5), "beta", of=4)),
+        ("Table A9", "final return and performance, mean and maximum", "main",
+         "final_return_and_performance", "main", None),
+        ("Sec. A10", "white noise never finds Mountain Car's goal", "main, vanilla",
+         "learning_curves_mountain_car", "car", never_found),
+        ("Sec. A10", "policies do not collapse", "main", "learning_curves_n_envs_4", "n_envs 4",
+         no_collapse),
+        ("Sec. A10", "Pendulum Swingup: beta 0, 0.5, 1 best with n_envs 1, 4, 32", "main",
+         "learning_curves_pendulum_swingup", "pendulum", pendulum),
+        ("Sec. A10", "learning curves, beta 0, 0.5 and 1, n_envs 1, 4 and 32", "main",
+         "learning_curves_n_envs_*", "three", None),
+        ("Sec. A10", "beta 1 gains with larger n_envs", "main", "learning_curves_n_envs_*",
+         "three", pink_gains_with_n_envs),
+        ("Fig. A11", "n_envs and n_steps do not matter if their product stays", "main, n_steps",
+         "n_envs_vs_n_steps", "n_steps", same_update_size),
+        ("Fig. A12", "half the epochs do worse", "n_epochs", "n_epochs_vs_beta", "n_epochs",
+         fewer_epochs_worse),
+        ("Fig. A12", "the preference for 0.5 is the same with 5, 10 and 20 epochs", "n_epochs",
+         "n_epochs_vs_beta", "n_epochs", same_preference),
+        ("Fig. A13", "gSDE is like beta 1.25 to 2", "main, gsde", "gsde_vs_beta", "gsde", like_red),
+        ("Table A14", "final returns", "main, vanilla", "final_return_per_beta", "all",
+         published_final_returns),
+    ]
+    # fmt: on
+    table = []
+    for where, says, presets, file, name, test in rows:
+        runs, total = parts.get(name, (None, 0))
+        verdict, text = "open", "no runs"
+        try:
+            if test and (name is None or len(runs)):
+                verdict, text = test() if name is None else test(runs)
+        except Unusable as error:
+            text = str(error)
+        row = {
+            "where": where,
+            "says": says,
+            "verdict": verdict,
+            "data": text,
+            "runs": "none needed",
+        }
+        if not test:
+            row |= {"verdict": "", "data": ""}
+        command = f"python plot.py {presets}"
+        if name:
+            cell = ["method", *AXES[:-1]]
+            here = runs.groupby(cell, dropna=False).seed.nunique().clip(upper=20).sum()
+            row["runs"] = f"{here} of {total}"
+            sweeps = [f"./run_sweep.sh {preset}" for preset in presets.split(", ")]
+            command = "; ".join([*sweeps, "python plot.py results runs/"])
+        table.append(row | {"command": command, "file": file})
+    return pd.DataFrame(table)
