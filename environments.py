@@ -290,11 +290,14 @@ def make_vector_env(env_id, n_envs, envpool=False, threads=1, max_episode_steps=
 def gains_by_threads(env):
     """Whether most of a step is MuJoCo's: only there may Python's other threads run meanwhile.
 
-    An environment in Python has no gain, and dm_control, whose Python takes longer than its
-    physics and whose model is not env.model, a loss.
+    That is so where a step has several of the simulator's. Measured with 50 environments, us a step
+    with 1 and 2 threads: swimmer maze 36 and 21, half cheetah 33 and 22, but point maze, whose step
+    is one, 20 and 27. dm_control, whose model is not env.model, is mostly Python.
     """
     mujoco = sys.modules.get("mujoco")
-    return mujoco is not None and isinstance(getattr(env, "model", None), mujoco.MjModel)
+    if mujoco is None or not isinstance(getattr(env, "model", None), mujoco.MjModel):
+        return False
+    return getattr(env, "frame_skip", getattr(env, "substeps", 1)) > 1
 
 
 def sync_vector_env(envs):
