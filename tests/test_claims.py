@@ -37,7 +37,7 @@ def verdicts(**methods):
     methods = {name: runs[runs.method == name] for name in methods}
     slow = mock.Mock(return_value=("open", ""))  # these have tests of their own
     names = ("published_final_returns", "comparable_counts", "best_beta_varies")
-    with mock.patch.multiple(analysis, **dict.fromkeys(names, slow)):
+    with mock.patch.multiple(claims, **dict.fromkeys(names, slow)):
         table = claims.coverage(methods, curves)
     return dict(zip(table.says, table.verdict, strict=True)), table.set_index("says")
 
