@@ -183,14 +183,18 @@ def make_seeds(n, *key):
     return np.random.SeedSequence(key).generate_state(n).tolist()
 
 
+def _compile_cache():
+    """The folder where torch.compile keeps what it has compiled, by its own rule."""
+    default = f"{tempfile.gettempdir()}/torchinductor_{getpass.getuser()}"
+    return os.environ.get("TORCHINDUCTOR_CACHE_DIR", default)
+
+
 def prepare_torch():
     """One thread, since more are slower for small networks; a compile cache that can be written."""
     torch.set_num_threads(1)
-    default = f"{tempfile.gettempdir()}/torchinductor_{getpass.getuser()}"
-    folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR", default)
     try:
-        os.makedirs(folder, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
+        os.makedirs(_compile_cache(), exist_ok=True)
+        tempfile.TemporaryFile(dir=_compile_cache()).close()
     except OSError:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = tempfile.mkdtemp()
 
@@ -256,7 +260,8 @@ def compiled(function):
     # cpp_wrapper calls the kernels from C++ instead of Python: 13 % less time in an update
     functions = [torch.compile(function, **how, options={"cpp_wrapper": True})]
     text = "compiling the update: about 20 seconds, once per machine ..."
-    wait = [threading.Timer(2, tqdm.write, [text])] if sys.stdout.isatty() else []
+    seconds = 5 if os.path.isdir(_compile_cache()) and os.listdir(_compile_cache()) else 0
+    wait = [threading.Timer(seconds, tqdm.write, [text])] if sys.stdout.isatty() else []
 
     def call(*args):
         if wait:
