@@ -299,7 +299,7 @@ def learn(agent, optimizer, batch, learning_rate, update, args):
 
 
 @environments.preserved_generators()  # evaluations must not change what training draws
-def evaluate(policy, envs, seeds, max_steps=20_000):
+def evaluate(policy, envs, seeds, max_steps=10_000):
     """Plays one episode of the policy in each environment: returns and lengths, (n_envs,) each.
 
     Returns are undiscounted. An environment whose episode has ended steps on until the longest has:
@@ -367,7 +367,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     # The state of environments cannot be saved in general: after a resume they begin new episodes
     environments.seed_global_generators(make_seeds(2, args.seed, 3, global_step))
     obs[-1], _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
-    running, limit = np.zeros((2, args.n_envs)), args.max_episode_steps or 20_000
+    running, limit = np.zeros((2, args.n_envs)), args.max_episode_steps or 10_000
     steps_per_update = args.n_steps * args.n_envs
     total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
     run.start(global_step, obs_dim=obs_dim, action_dim=action_dim)

@@ -502,7 +502,7 @@ def test_no_time_limit(train, tiny, tmp_path, mine):
     process = train(flags)
     assert process.returncode == 1
     last = process.stderr.strip().splitlines()[-1]
-    assert last.startswith("error: ") and "20000 steps: --max-episode-steps" in last
+    assert last.startswith("error: ") and "10000 steps: --max-episode-steps" in last
     assert not (only_run(tmp_path) / "summary.json").exists()
     process = train(f"{flags} --max-episode-steps 40 --overwrite")
     assert process.returncode == 0, process.stderr
