@@ -391,7 +391,8 @@ def transfer(runs):
         betas = sorted(group.beta.unique())
         labels = betas if len(betas) < 5 else [-1, 0, 0.5, 1, 2]
         ax.set_xticks(labels, [f"{beta:g}" for beta in labels])
-        count = f"{group.environment.nunique()} environments, {len(group)} runs"
+        n = group.environment.nunique()
+        count = f"{n} environment{'s'[: n > 1]}, {len(group)} runs"
         ax.set_title(f"{name if name == 'overall' else METHOD_NAMES[name]}\n{count}")
     if "overall" in chosen:
         legend_above(fig, *((METHOD_NAMES[name], METHOD_LOOK[name]) for name in methods))
