@@ -213,9 +213,8 @@ def _bin_scale(beta, T):
     # Dividing by sigma cancels any common factor, so the largest scale may be 1: then no beta
     # overflows.
     beta = beta.unsqueeze(-1)
-    s = torch.exp(
-        -0.5 * beta * (log_f - torch.where(beta > 0, log_f[0], log_f[-1]))
-    )  # s_1 .. s_(T // 2)
+    largest = torch.where(beta > 0, log_f[0], log_f[-1])
+    s = torch.exp(-0.5 * beta * (log_f - largest))  # s_1 .. s_(T // 2)
     w = s.clone()
     w[..., -1] *= (1 + T % 2) / 2
     sigma = 2 / T * w.square().sum(-1, keepdim=True).sqrt()
