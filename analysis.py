@@ -55,7 +55,7 @@ SHARED += ["anneal_lr", "bootstrap_timeouts"]
 AXES = ["environment", "beta", "n_envs", "n_steps", "n_epochs", "seed"]
 EVALUATION = ["eval_episodes", "eval_once_per_policy"]
 NOT_ARGUMENTS = ["path", "source", "status", "git_commit", "wall_seconds", "performance"]
-NOT_ARGUMENTS += ["final_return", "exp_name", "env_id", "vanilla", "threads"]
+NOT_ARGUMENTS += ["final_return", "exp_name", "env_id", "vanilla", "threads", "beta_auto"]
 WHOLE = ["n_envs", "n_steps", "n_epochs", "seed"]
 CELL = ["environment", "n_envs"]
 
@@ -123,12 +123,14 @@ def read_run(folder):
         if any(isinstance(value, float) and not math.isfinite(value) for value in args.values()):
             raise ValueError("config.json has a number that is not finite")
         whole = {key: int(args[key]) for key in WHOLE}
-        if not all((key == "seed") <= value < 2**63 for key, value in whole.items()):
+        if not all((key != "seed") <= value < 2**63 for key, value in whole.items()):
             raise ValueError("config.json has a whole number that is too large or too small")
         beta = "vanilla" if args["vanilla"] else "_".join(map(str, args["beta"]))
         known = {"env_id": str(args["env_id"]), "beta": betas_text(beta)}
         expected = int(args["total_timesteps"]) // int(args["eval_freq"])
         run = {**args, **whole, **known, "git_commit": config["git_commit"]}
+        if args.get("env_kwargs") is not None:
+            run["env_kwargs"] = json.dumps(args["env_kwargs"], sort_keys=True)
         rows = (folder / "evaluations.csv").read_text().splitlines()[1:]
         table = np.array([row.split(",")[:2] for row in rows], float).reshape(-1, 2)
         steps, returns = table[:, 0].astype(int), table[:, 1]

@@ -24,8 +24,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers.utils import RunningMeanStd
 
 
 def silence():
@@ -163,12 +164,13 @@ class FlatSpaces(gym.Wrapper):
         return spaces.flatten(self.env.observation_space, obs).astype(np.float32)
 
 
-def make_env(env_id, max_episode_steps=None, **kwargs):
+def make_env(env_id, max_episode_steps=None, rescale_actions=False, env_kwargs=None, **kwargs):
     """Makes one environment with observations (obs_dim,) float32 and a Box action space.
 
     env_id is a registered id or "module:Id", whose module, in the current folder or installed,
     registers the Id. max_episode_steps takes the place of the task's own time limit (but not of
-    those inside dm_control's locomotion and manipulation).
+    those inside dm_control's locomotion and manipulation). With rescale_actions, actions in [-1, 1]
+    stand for those between its bounds. env_kwargs: arguments of the environment, a dict.
 
     Raises gymnasium.error.Error with a message for the user: unknown id (naming close matches), a
     package that is missing, actions that are not continuous, observations without a fixed size.
@@ -185,8 +187,9 @@ def make_env(env_id, max_episode_steps=None, **kwargs):
             import shimmy  # noqa: F401  registers the dm_control ids
         if max_episode_steps is not None and is_from_dm_control_suite(name):
             kwargs["task_kwargs"] = {"time_limit": math.inf}  # s, its limit inside Gymnasium's
+        kwargs |= {"disable_env_checker": True, **(env_kwargs or {})}
         with contextlib.nullcontext() if "render_mode" in kwargs else tiny_textures():
-            env = gym.make(name, max_episode_steps, disable_env_checker=True, **kwargs)
+            env = gym.make(name, max_episode_steps, **kwargs)
     except gym.error.Error as error:
         if module and name in gym.registry:  # then it is the environment's own error
             raise RuntimeError(f"{env_id} cannot be made") from error
@@ -199,6 +202,10 @@ def make_env(env_id, max_episode_steps=None, **kwargs):
         raise gym.error.DependencyNotInstalled(
             f"{env_id} needs a package that is not installed: {error}"
         ) from error
+    except Exception as error:
+        if not env_kwargs or (module and "unexpected keyword argument" not in str(error)):
+            raise
+        raise gym.error.Error(f"{env_id} cannot be made with --env-kwargs: {error}") from error
     actions, observations = env.action_space, env.observation_space
     if not isinstance(actions, spaces.Box) or not np.issubdtype(actions.dtype, np.floating):
         raise gym.error.Error(
@@ -208,6 +215,10 @@ def make_env(env_id, max_episode_steps=None, **kwargs):
         raise gym.error.Error(
             f"{env_id} has observations {observations}; the networks need a fixed number of values"
         )
+    if rescale_actions:
+        if not actions.is_bounded():
+            raise gym.error.Error(f"--rescale-actions needs bounds, {env_id} has {actions}")
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     return FlatSpaces(env)
 
 
@@ -263,7 +274,113 @@ def tiny_textures():
             common.ASSETS.update(assets)
 
 
-def make_vector_env(env_id, n_envs, envpool=False, threads=1, max_episode_steps=None):
+def env_options(args):
+    """What a run's arguments say on how each environment is made: keyword arguments of make_env."""
+    names = ("max_episode_steps", "rescale_actions", "env_kwargs")
+    return {name: getattr(args, name) for name in names}
+
+
+def make_envs(args):
+    """Makes a run's environments: to train in, to evaluate in, and one to film, or None.
+
+    And what has a state_dict, the normalization's. Raises as make_env does.
+    """
+    options = env_options(args)
+    video_env = make_render_env(args.env_id, **options) if args.capture_video else None
+    options |= {"envpool": args.envpool, "threads": args.threads}
+    envs = make_vector_env(args.env_id, args.n_envs, **options)
+    eval_envs = make_vector_env(args.env_id, args.eval_episodes, **options)
+    note_on_bounds(args.env_id, envs.single_action_space)
+    envs = NormalizedVectorEnv(envs, args.normalize_obs, args.normalize_rewards, args.gamma)
+    if args.normalize_obs:
+        eval_envs = envs.frozen(eval_envs)
+        if video_env:
+            space = video_env.observation_space
+            video_env = gym.wrappers.TransformObservation(video_env, envs.normalized, space)
+    return envs, eval_envs, video_env, envs
+
+
+def note_on_bounds(env_id, space):
+    """Prints a line where PPO's first actions, about 0 with a std of 1, miss most of the space."""
+    with np.errstate(invalid="ignore"):
+        center, half = (space.high + space.low) / 2, (space.high - space.low) / 2
+    far = np.isfinite(half) & ((half > 4) | (half < 0.25) | (abs(center) > half / 2))
+    if far.any() and env_id not in NAMES:  # the paper's are as the paper had them
+        low, high = (x[np.argmax(far)] for x in (space.low, space.high))
+        print(f"note: {env_id} has actions from {low:g} to {high:g}, and the policy begins with a "
+              "std of 1 around 0: --rescale-actions makes it [-1, 1]", file=sys.stderr)  # fmt: skip
+
+
+class NormalizedVectorEnv(VectorWrapper):
+    """Normalizes observations and rewards by running statistics, as VecNormalize does.
+
+    That is Stable-Baselines3's. Observations are brought to mean 0 and std 1 of all so far. Rewards
+    are divided by the std of the discounted return so far; their mean stays, it is part of the
+    task; they are in infos["raw_rewards"] as they were. Both are clipped at 10.
+    """
+
+    def __init__(self, env, obs=False, rewards=False, gamma=0.99):
+        super().__init__(env)
+        self._gamma, self._returns, self._training = gamma, np.zeros(self.num_envs), True
+        self._statistics = {}
+        if obs:
+            self._statistics["obs"] = RunningMeanStd(shape=env.single_observation_space.shape)
+        if rewards:
+            self._statistics["returns"] = RunningMeanStd()
+
+    def frozen(self, env):
+        """Another environment with observations normalized as here, which changes no statistics."""
+        other = NormalizedVectorEnv(env)
+        other._statistics, other._training = {"obs": self._statistics["obs"]}, False
+        return other
+
+    def normalized(self, obs):
+        statistics = self._statistics["obs"]
+        obs = (obs - statistics.mean) / np.sqrt(statistics.var + 1e-8)
+        return np.clip(obs, -10, 10).astype(np.float32)
+
+    def reset(self, **kwargs):
+        obs, infos = self.env.reset(**kwargs)
+        self._returns[:] = 0
+        return self._observed(obs), infos
+
+    def step(self, actions):
+        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        done = terminated | truncated
+        if "returns" in self._statistics:
+            infos["raw_rewards"] = rewards
+            self._returns = self._returns * self._gamma + rewards
+            self._statistics["returns"].update(self._returns)
+            std = np.sqrt(self._statistics["returns"].var + 1e-8)
+            rewards = np.clip(rewards / std, -10, 10)
+            self._returns[done] = 0
+        if "obs" in self._statistics:
+            obs = self._observed(obs)
+            for i in np.flatnonzero(done):
+                infos["final_obs"][i] = self.normalized(infos["final_obs"][i])
+        return obs, rewards, terminated, truncated, infos
+
+    def _observed(self, obs):
+        if "obs" not in self._statistics:
+            return obs
+        if self._training:
+            self._statistics["obs"].update(obs)
+        return self.normalized(obs)
+
+    def state_dict(self):
+        """The statistics, as plain numbers and lists."""
+        return {
+            name: {key: np.asarray(value).tolist() for key, value in vars(statistics).items()}
+            for name, statistics in self._statistics.items()
+        }
+
+    def load_state_dict(self, state):
+        for name, values in state.items():
+            for key, value in values.items():
+                setattr(self._statistics[name], key, np.asarray(value))
+
+
+def make_vector_env(env_id, n_envs, envpool=False, threads=1, **options):
     """Makes n_envs environments that step together, with SAME_STEP autoreset.
 
     Observations are (n_envs, obs_dim) float32 and overwritten by the next step. The step that ends
@@ -272,16 +389,17 @@ def make_vector_env(env_id, n_envs, envpool=False, threads=1, max_episode_steps=
     episodes instead.
 
     With envpool they are EnvPool's. Up to `threads` threads step them where that helps, with the
-    same results. max_episode_steps takes the place of the task's own time limit, if it is given.
+    same results. options: as make_env has them, of which EnvPool's take none.
     Raises as make_env does.
     """
-    if envpool and max_episode_steps is not None:
-        raise gym.error.Error(
-            f"EnvPool's {env_id} has its own time limit: --max-episode-steps needs --no-envpool"
-        )
     if envpool:
+        if options.get("max_episode_steps") is not None or options.get("env_kwargs"):
+            raise gym.error.Error(
+                f"EnvPool's {env_id} is as it is: --max-episode-steps and --env-kwargs need "
+                "--no-envpool"
+            )
         return EnvPoolVectorEnv(env_id, n_envs, threads)
-    envs = [make_env(env_id, max_episode_steps=max_episode_steps) for _ in range(n_envs)]
+    envs = [make_env(env_id, **options) for _ in range(n_envs)]
     if min(threads, n_envs) > 1 and gains_by_threads(envs[0].unwrapped):
         return ThreadedVectorEnv(envs, threads)
     return sync_vector_env(envs)
@@ -365,6 +483,12 @@ class ThreadedVectorEnv(VectorEnv):
         self._pool.shutdown()
         for part in self._parts:
             part.close()
+
+
+def envpool_suits(args):
+    """Whether EnvPool is installed and has a run's task as its arguments say."""
+    changed = args.max_episode_steps is not None or args.env_kwargs
+    return envpool_has(args.env_id) and not changed
 
 
 def envpool_has(env_id):
@@ -522,8 +646,8 @@ class EnvPoolVectorEnv(VectorEnv):
         return state
 
 
-def make_render_env(env_id, max_episode_steps=None):
-    """Makes one environment that renders frames without a display.
+def make_render_env(env_id, **options):
+    """Makes one environment that renders frames without a display; options as make_env has them.
 
     Raises gymnasium.error.Error where it cannot, and otherwise as make_env does.
     """
@@ -532,7 +656,7 @@ def make_render_env(env_id, max_episode_steps=None):
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains without sound
     try:
-        env = make_env(env_id, max_episode_steps, render_mode="rgb_array")
+        env = make_env(env_id, render_mode="rgb_array", **options)
     except TypeError as error:
         if "unexpected keyword argument 'render_mode'" not in str(error):
             raise

@@ -30,8 +30,7 @@ from torch import nn
 
 import environments
 import run_files
-from colored_noise import ColoredNoiseProcess
-from environments import make_vector_env
+from colored_noise import ColoredNoiseProcess, projected_beta
 from run_files import RunFolder, fail, make_seeds, stop_if_asked
 
 
@@ -46,10 +45,15 @@ def parse_args(argv=None, **defaults):
     add("--eval-freq", type="count", default=10_240, help="environment steps between evaluations")
     add("--eval-episodes", type="count", default=50, help="episodes per evaluation, in parallel")
     add("--eval-once-per-policy", action=flag, default=False, help="one policy is not played anew")
+    add = parser.add_argument_group("environment").add_argument
+    add("--env-kwargs", type="key_value", nargs="+", action="extend", help="key=value of its own")
     add("--max-episode-steps", type="count", help="a time limit in place of the environment's own")
+    add("--rescale-actions", action=flag, default=False, help="[-1, 1] stands for its bounds")
+    add("--normalize-obs", action=flag, default=False, help="by their running mean and std")
+    add("--normalize-rewards", action=flag, default=False, help="by the std of discounted returns")
     add = parser.add_argument_group("colored noise").add_argument
-    add("--beta", type="real", nargs="+", default=[0.5], help="0 white, 1 pink, 2 red; one number "
-        "for all action dimensions, or one for each")  # fmt: skip
+    add("--beta", type="real_or_auto", nargs="+", default=[0.5], help="0 white, 1 pink, 2 red; one "
+        "number for all action dimensions, or one for each; auto: from n_envs")  # fmt: skip
     add("--noise-seq-len", type="at_least_2", default=1000, help="T, steps until new sequences")
     add("--vanilla", action="store_true", help="white noise from torch, as in ordinary PPO")
     add = parser.add_argument_group("PPO").add_argument
@@ -66,8 +70,7 @@ def parse_args(argv=None, **defaults):
     add("--ent-coef", type="real", default=0.0, help="weight of the entropy bonus")
     add("--vf-coef", type="real", default=0.5, help="weight of the value loss")
     add("--max-grad-norm", type="positive", default=0.5, help="bound on the norm of the gradient")
-    add("--bootstrap-timeouts", action=flag, default=True,
-        help="add gamma * V(final observation) at time limits")  # fmt: skip
+    add("--bootstrap-timeouts", action=flag, default=True, help="time limits add gamma * V(obs)")
     add = parser.add_argument_group("running").add_argument
     add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
     add("--threads", type="count", default=run_files.n_cores(), help="of evaluation and EnvPool")
@@ -86,9 +89,15 @@ def parse_args(argv=None, **defaults):
         parser.error(f"no evaluation: --eval-freq {args.eval_freq} is over --total-timesteps")
     if args.resume and args.overwrite:
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
+    args.env_kwargs = dict(args.env_kwargs) if args.env_kwargs else None
+    args.beta_auto = args.beta == ["auto"]
+    if args.beta_auto:
+        args.beta = [projected_beta(args.n_envs, args.n_steps, args.noise_seq_len)]
+        print(f"--beta auto is {args.beta[0]:.3g} here")
+    if "auto" in args.beta:
+        parser.error("--beta auto is one number for all action dimensions")
     if args.envpool is None:  # a run that is there keeps what it has
-        usable = environments.envpool_has(args.env_id) and args.max_episode_steps is None
-        args.envpool = run_files.recorded(args, "envpool", default=usable)
+        args.envpool = run_files.recorded(args, "envpool", environments.envpool_suits(args))
     run_files.check_device(args.device)
     return run_files.Args(**vars(args))
 
@@ -173,7 +182,7 @@ def collect(agent, act, envs, storage, running, args, bar):
         clipped = np.clip(actions[t], space.low, space.high)
         obs[t + 1], rewards[t], terminated, truncated, infos = envs.step(clipped)
         dones[t] = terminated | truncated
-        running[0] += rewards[t]
+        running[0] += infos.get("raw_rewards", rewards[t])
         running[1] += 1
         for i in np.flatnonzero(dones[t]):
             episodes.append(running[:, i].tolist())
@@ -328,12 +337,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     run_files.prepare_torch()
     # Everything that can fail comes first, before run.start() touches anything of an earlier run
     with run_files.one_line_for(gym.error.Error):
-        how = (args.envpool, args.threads, args.max_episode_steps)
-        video_env = (
-            environments.make_render_env(args.env_id, how[2]) if args.capture_video else None
-        )
-        envs = make_vector_env(args.env_id, args.n_envs, *how)
-        eval_envs = make_vector_env(args.env_id, args.eval_episodes, *how)
+        envs, eval_envs, video_env, normalization = environments.make_envs(args)
     obs_dim = envs.single_observation_space.shape[0]
     action_dim = math.prod(envs.single_action_space.shape)
     if len(args.beta) not in (1, action_dim):
@@ -354,15 +358,16 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     params = nn.utils.parameters_to_vector(agent.parameters())
     step = torch.zeros((), dtype=torch.float64, device=args.device)
     optimizer = (torch.zeros_like(params), torch.zeros_like(params), step)
-    if args.compile:
-        update = run_files.compiled(update)
+    update = run_files.compiled(update) if args.compile else update
 
     global_step, next_eval, episodes = 0, args.eval_freq, []
     if run.checkpoint:
-        agent.load_state_dict(run.checkpoint["agent"])
-        optimizer = tuple(x.to(args.device) for x in run.checkpoint["optimizer"])
-        noise.load_state_dict(run.checkpoint["noise"])
-        torch.set_rng_state(run.checkpoint["torch_rng"])
+        with run.one_line_if_it_does_not_fit():  # after an edit, say
+            agent.load_state_dict(run.checkpoint["agent"])
+            normalization.load_state_dict(run.checkpoint.get("normalization", {}))
+            optimizer = tuple(x.to(args.device) for x in run.checkpoint["optimizer"])
+            noise.load_state_dict(run.checkpoint["noise"])
+            torch.set_rng_state(run.checkpoint["torch_rng"])
         global_step, next_eval = run.checkpoint["global_step"], run.checkpoint["next_eval"]
     # The state of environments cannot be saved in general: after a resume they begin new episodes
     environments.seed_global_generators(make_seeds(2, args.seed, 3, global_step))
@@ -376,17 +381,18 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
         while True:
             # Evaluate at every multiple of eval_freq at which this policy is the one that acts
             policy, returns = run_files.numpy_policy(agent.actor_mean), None
+            acting = {"agent": agent.state_dict(), "normalization": normalization.state_dict()}
             while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
                 if returns is None or not args.eval_once_per_policy:
                     seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
                     returns, lengths = evaluate(policy, eval_envs, seeds, limit)
-                run.add_evaluation(next_eval, returns, lengths)
+                run.add_evaluation(next_eval, returns, lengths, acting)
                 bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
                 if video_env and run.is_video_due(next_eval):
                     path = run.path / "videos" / f"step_{next_eval}.mp4"
                     environments.record_video(video_env, policy, path, seeds[0])
                 next_eval += args.eval_freq
-            state = {"agent": agent.state_dict(), "optimizer": optimizer, "next_eval": next_eval}
+            state = {**acting, "optimizer": optimizer, "next_eval": next_eval}
             state |= {"noise": noise.state_dict(), "torch_rng": torch.get_rng_state()}
             run.keep(state, global_step, write=returns is not None or global_step == total)
             if global_step == total:
@@ -409,10 +415,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
                 run.log_rollout(global_step, episodes, {"std": agent.log_std.exp().mean().item()})
                 episodes = []
 
-    summary = run.finish(global_step)
-    print(f"performance {summary['performance']:.4g}, "
-          f"final return {summary['final_return']:.4g}, "
-          f"{summary['wall_seconds'] / 60:.1f} min: {run.path}")  # fmt: skip
+    run.finish(global_step)
 
 
 if __name__ == "__main__":

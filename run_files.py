@@ -7,6 +7,7 @@ length they had at the checkpoint, so that every evaluation and every point is t
 
 import argparse
 import contextlib
+import copy
 import getpass
 import importlib.metadata
 import io
@@ -42,7 +43,8 @@ FREE_ARGS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", 
 FREE_ARGS |= {"track"}
 # What runs did that are older than the argument
 ABSENT = {"method": "ppo", "envpool": False, "anneal_lr": False, "max_episode_steps": None}
-ABSENT |= {"eval_once_per_policy": False}
+ABSENT |= {"eval_once_per_policy": False, "env_kwargs": None, "rescale_actions": False}
+ABSENT |= {"normalize_obs": False, "normalize_rewards": False, "beta_auto": False}
 SECONDS_BETWEEN_CHECKPOINTS = 5
 
 # --- The end of a program: mistakes and signals
@@ -124,6 +126,26 @@ NUMBERS = {  # the types of arguments; 1e15: floats are exact up to there, and i
 }
 
 
+def real_or_auto(text):
+    return text if text == "auto" else NUMBERS["real"](text)
+
+
+def key_value(text):
+    """An argparse type: the pair (key, value) of "key=value".
+
+    A value is a number, true, false or null, a list such as 3,0, any other JSON, or else text.
+    """
+    key, equals, value = text.partition("=")
+    if not (equals and key.isidentifier()):
+        raise argparse.ArgumentTypeError(f"{text} is not key=value")
+    words = {"True": "true", "False": "false", "None": "null"}  # Python's would be text, and true
+    try:
+        values = json.loads(f"[{words.get(value, value)}]")
+    except (ValueError, RecursionError):
+        values = [value]
+    return key, values if len(values) > 1 else [*values, value][0]
+
+
 class Args:
     """Parsed arguments, read-only: compiled code takes them for constants, and config.json too."""
 
@@ -143,7 +165,8 @@ class ArgumentParser(argparse.ArgumentParser):
     def __init__(self, **kwargs):
         formatter = argparse.ArgumentDefaultsHelpFormatter
         super().__init__(formatter_class=formatter, allow_abbrev=False, **kwargs)
-        for name, parse in NUMBERS.items():
+        others = {"real_or_auto": real_or_auto, "key_value": key_value}
+        for name, parse in {**NUMBERS, **others}.items():
             self.register("type", name, parse)
         self._negative_number_matcher = re.compile(
             r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE
@@ -288,8 +311,8 @@ def compiled(function):
 
 def run_path(args):
     """Path of a run's folder: it shows the experiment, environment, beta, n_envs and seed."""
-    beta = "vanilla" if args["vanilla"] else "beta_" + "_".join(f"{b:g}" for b in args["beta"])
-    beta = "gsde" if args["method"] == "gsde" else beta
+    beta = "beta_" + ("auto" if args["beta_auto"] else "_".join(f"{b:g}" for b in args["beta"]))
+    beta = "gsde" if args["method"] == "gsde" else "vanilla" if args["vanilla"] else beta
     env = re.sub(r"[/:\\]", "_", args["env_id"])
     path = Path(args["runs_dir"]) / args["exp_name"] / env / beta
     return path / f"n_envs_{args['n_envs']}" / f"seed_{args['seed']}"
@@ -309,7 +332,7 @@ class RunFolder:
     def __init__(self, args):
         args = vars(args)
         self.path, self.checkpoint, self.summary = run_path(args), None, None
-        self._args, self._wandb, self._state = args, None, None
+        self._args, self._wandb, self._state, self._best = args, None, None, None
         self._start_time, self._earlier_seconds, self._written = time.time(), 0.0, 0.0
         if args["track"]:
             with one_line_for(ImportError, because="--track needs pip install wandb: "):
@@ -325,8 +348,8 @@ class RunFolder:
             fail(f"cannot write to {self.path} ({error.strerror}): choose another --runs-dir")
         if args["overwrite"] or not (self.path / "config.json").exists():
             return
-        self._check_same_run()
-        if (self.path / "summary.json").exists():
+        longer = self._check_same_run()
+        if (self.path / "summary.json").exists() and not longer:
             self.summary = self._read_json("summary.json")
         elif not args["resume"]:
             fail(f"{self.path} holds an unfinished run: add --resume to continue it, or "
@@ -344,7 +367,14 @@ class RunFolder:
         with self._one_line_errors():
             if self.checkpoint:
                 self._earlier_seconds = self.checkpoint["wall_seconds"]
+                (self.path / "summary.json").unlink(missing_ok=True)  # of a run trained longer
+                config = self._read_json("config.json")
+                config["args"]["total_timesteps"] = self._args["total_timesteps"]
+                self._write_json("config.json", config)
                 self._cut_back(self.checkpoint["file_sizes"])
+                self._best = self.checkpoint.get("best")
+                if self._best:
+                    self._save("best.pt", self._best)
             else:
                 self._clear()
                 config = {"args": self._args, "resolved": resolved, "versions": _versions()}
@@ -394,8 +424,11 @@ class RunFolder:
         freq = self._args["eval_freq"]
         return step // freq % 10 == 0 or step + freq > self._args["total_timesteps"]
 
-    def add_evaluation(self, step, returns, lengths):
-        """Appends a row to evaluations.csv. returns, lengths: (eval_episodes,)."""
+    def add_evaluation(self, step, returns, lengths, acting):
+        """Appends a row to evaluations.csv. returns, lengths: (eval_episodes,).
+
+        acting: dict of state_dicts, of all that acted; kept in best.pt if its mean return is best.
+        """
         if not np.isfinite(returns).all():
             episode = np.flatnonzero(~np.isfinite(returns))[0]
             fail(f"return {returns[episode]} in {self._args['env_id']}, episode {episode} of the "
@@ -403,6 +436,10 @@ class RunFolder:
         row = f"{step},{returns.mean():.9g},{returns.std():.9g},{lengths.mean():.9g}\n"
         with self._one_line_errors():
             self._append("evaluations.csv", row.encode())
+            if self._best is None or returns.mean() > self._best["return_mean"]:
+                best = {**acting, "step": step, "return_mean": returns.mean().item()}
+                self._best = copy.deepcopy(best)
+                self._save("best.pt", self._best)
         scalars = {"return_mean": returns.mean(), "return_std": returns.std()}
         scalars["length_mean"] = lengths.mean()
         self.log(step, {f"evaluation/{name}": value for name, value in scalars.items()})
@@ -418,12 +455,12 @@ class RunFolder:
                 self._buffer.seek(0)
                 self._buffer.truncate()
             sizes = self._sizes.copy()
-            self._state = {**state, "global_step": step, "file_sizes": sizes}
+            self._state = {**state, "global_step": step, "file_sizes": sizes, "best": self._best}
             if write or time.time() > self._written + SECONDS_BETWEEN_CHECKPOINTS:
                 self._write_checkpoint()
 
     def finish(self, steps):
-        """Writes summary.json, which makes the run complete, and returns it."""
+        """Writes summary.json, which makes the run complete, and says what is in it."""
         rows = (self.path / "evaluations.csv").read_text().splitlines()[1:]
         returns = [float(row.split(",")[1]) for row in rows]
         summary = {
@@ -437,7 +474,9 @@ class RunFolder:
         if self._wandb:
             self._wandb.summary.update(summary)
             self._wandb.finish()
-        return summary
+        print(f"performance {summary['performance']:.4g}, "
+              f"final return {summary['final_return']:.4g}, "
+              f"{summary['wall_seconds'] / 60:.1f} min: {self.path}")  # fmt: skip
 
     @contextlib.contextmanager
     def _one_line_errors(self):
@@ -448,33 +487,51 @@ class RunFolder:
             fail(f"{error}; when that is mended, continue with --resume")
 
     def _write_checkpoint(self):
-        data = (
-            io.BytesIO()
-        )  # straight to the file, torch.save would not raise an OSError on a full disk
-        torch.save({**self._state, "wall_seconds": self.seconds()}, data)
-        self._write("checkpoint.pt", data.getvalue())
+        self._save("checkpoint.pt", {**self._state, "wall_seconds": self.seconds()})
         self._written = time.time()
+
+    def _save(self, name, state):
+        data = io.BytesIO()  # straight to the file, torch.save raises no OSError on a full disk
+        torch.save(state, data)
+        self._write(name, data.getvalue())
 
     def _event_files(self):
         return sorted(path.name for path in self.path.glob("events.out.tfevents.*"))
 
     def _clear(self):
         """Removes what a run has left, summary first: without it, the rest is an unfinished run."""
-        files = ("summary.json", "checkpoint.pt", "evaluations.csv", *self._event_files())
+        files = ("summary.json", "checkpoint.pt", "best.pt", "evaluations.csv")
+        files += tuple(self._event_files())
         for name in (*files, "config.json"):
             (self.path / name).unlink(missing_ok=True)
         shutil.rmtree(self.path / "videos", ignore_errors=True)
         self._sizes = {}
 
     def _check_same_run(self):
-        """Refuses to mix runs: what decides the result must be the same as in config.json."""
+        """Refuses to mix runs: what decides the result must be the same as in config.json.
+
+        Returns whether this is the same run, but longer.
+        """
         old = ABSENT | self._read_json("config.json").get("args", {})
         args = json.loads(json.dumps(self._args))
+        total, old_total = args["total_timesteps"], old.get("total_timesteps")
+        could_be = isinstance(old_total, int) and total > old_total
+        longer = could_be and args["resume"]
+        if longer and args["anneal_lr"]:
+            fail("with --anneal-lr a run cannot be trained longer: its learning rate is made for "
+                 f"--total-timesteps {old_total}", 2)  # fmt: skip
+        finished = (self.path / "summary.json").exists()
+        if longer and finished and not (self.path / "checkpoint.pt").exists():
+            fail(f"{self.path} has no checkpoint.pt from which to train longer")
         for name in sorted((old.keys() | args.keys()) - FREE_ARGS):
-            if old.get(name) != args.get(name):
+            if old.get(name) != args.get(name) and not (longer and name == "total_timesteps"):
                 flag = "--" + name.replace("_", "-")
+                advice = "or --overwrite to replace it"
+                if name == "total_timesteps" and could_be:
+                    advice = "--resume to train it longer, or --overwrite to replace it"
                 fail(f"the run in {self.path} has {flag} {old.get(name)}, not {args.get(name)}: "
-                     "choose another --exp-name, or --overwrite to replace it", 2)  # fmt: skip
+                     f"choose another --exp-name, {advice}", 2)  # fmt: skip
+        return longer
 
     def _read_checkpoint(self):
         path = self.path / "checkpoint.pt"
@@ -489,6 +546,15 @@ class RunFolder:
             reason = str(error).split(". ")[0][:100]
             fail(f"{path} is damaged ({reason}): restore it, or start again with --overwrite")
         return checkpoint
+
+    @contextlib.contextmanager
+    def one_line_if_it_does_not_fit(self):
+        """Around the loading of a checkpoint, maybe of other networks or noise."""
+        try:
+            yield
+        except (KeyError, ValueError, RuntimeError, AttributeError) as error:
+            fail(f"{self.path / 'checkpoint.pt'} does not fit this script ({error!s:.200}): undo "
+                 "the edit, or choose another --exp-name, or --overwrite")  # fmt: skip
 
     def _cut_back(self, sizes):
         self._sizes = sizes

@@ -445,6 +445,20 @@ def test_ranks_are_of_the_betas_that_are_there(tmp_path):
     assert grid.idxmax().tolist() == [0.5, 1]
 
 
+def test_arguments_of_the_environment_are_told_apart(tmp_path):
+    """And packed as text; that a beta was found by --beta auto is no difference."""
+    for seed, env_kwargs in enumerate([None, {"b": 2, "a": [3, 0]}, {"a": [3, 0], "b": 2}]):
+        auto = {"beta_auto": seed == 2}
+        write_run(tmp_path / "runs", PENDULUM, 0.304, 4, seed, [1.0], env_kwargs=env_kwargs, **auto)
+    analysis.pack(*analysis.load([tmp_path / "runs"]), tmp_path / "packed.csv")
+    for path in (tmp_path / "runs", tmp_path / "packed.csv"):
+        runs, _ = analysis.load([path])
+        assert sorted(runs.env_kwargs.dropna()) == ['{"a": [3, 0], "b": 2}'] * 2
+        with pytest.raises(analysis.Unusable, match="--env-kwargs.* must not be averaged"):
+            analysis.select(runs)
+        assert len(analysis.select(runs[runs.env_kwargs.notna()])[0]) == 2
+
+
 def test_evaluations_may_be_mixed_and_the_report_says_so(tmp_path):
     write_run(tmp_path, CAR, 0.5, 4, 1, [1.0, 2.0], eval_episodes=50)
     write_run(tmp_path, CAR, 0.5, 4, 2, [1.0, 2.0], eval_episodes=10, eval_once_per_policy=True)

@@ -113,6 +113,21 @@ def test_layers(tmp_path, original, edits, in_numpy):
     assert final_return != pytest.approx(original[1], rel=1e-3)
 
 
+def test_an_edit_does_not_fit_an_earlier_checkpoint(tmp_path, capsys):
+    """And --resume loses nothing of the run that is there."""
+    run(edit(tmp_path), tmp_path)
+    (folder,) = (path.parent for path in tmp_path.rglob("summary.json"))
+    (folder / "summary.json").unlink()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    module = edit(tmp_path, (HIDDEN, f"nn.LayerNorm(64), {HIDDEN}"))
+    flags = FLAGS.replace("--overwrite", "--resume --no-compile")
+    with pytest.raises(SystemExit) as ended:
+        module.main(module.parse_args(f"{flags} --runs-dir {tmp_path / 'runs'}".split()))
+    (line,) = capsys.readouterr().err.splitlines()[-1:]
+    assert ended.value.code == 1 and "does not fit this script" in line and "Missing key" in line
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
 @pytest.mark.parametrize("flags", ["--no-compile", ""])
 def test_log_the_gradient_norm(tmp_path, flags):
     line = "    params, optimizer = adam(params, grads, optimizer, learning_rate)"
@@ -172,8 +187,9 @@ def main("""
 
 def test_normalize_observations_by_a_wrapper(tmp_path):
     """Written out, since Gymnasium's own for vector environments refuse SAME_STEP autoreset."""
-    make = "make_vector_env(args.env_id, args.n_envs, *how)"
-    module = edit(tmp_path, (make, f"NormalizeObservations({make})"), ("def main(", NORMALIZE))
+    make = "        envs, eval_envs, video_env, normalization = environments.make_envs(args)\n"
+    wrap = f"{make}        envs = NormalizeObservations(envs)\n"
+    module = edit(tmp_path, (make, wrap), ("def main(", NORMALIZE))
     observations = []
 
     def learn(agent, optimizer, batch, *_):

@@ -21,12 +21,14 @@ import torch
 from conftest import ROOT, SCRIPT
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import environments
 import ppo_colored_continuous as ppo
 import run_files
+from colored_noise import projected_beta
 
 # A larger learning rate than the paper's: with that, returns pass 90 at about 160,000 steps
 FAST = "--learning-rate 1e-3 --total-timesteps 98304 --eval-freq 8192 --eval-episodes 10"
-FILES = {"config.json", "evaluations.csv", "checkpoint.pt", "summary.json", "lock"}
+FILES = {"config.json", "evaluations.csv", "checkpoint.pt", "best.pt", "summary.json", "lock"}
 
 
 def only_run(tmp_path):
@@ -683,3 +685,73 @@ def test_wandb_ids(monkeypatch, tmp_path):
     ids = [how["id"] for how in started]
     assert ids[0] == ids[2] and len(set(ids)) == 3
     assert all(re.fullmatch(r"[\w.-]{8,128}", x) for x in ids)
+
+
+def test_a_finished_run_can_be_trained_longer(train, tiny, tmp_path):
+    """It goes on with the next evaluation, as one that was meant to be as long from the start."""
+    assert train(tiny).returncode == 0
+    folder = only_run(tmp_path)
+    first = (folder / "evaluations.csv").read_bytes()
+    longer = tiny.replace("4096", "8192")
+    assert_one_line_error(train(longer), "4096, not 8192", "--resume to train it longer", code=2)
+    assert (folder / "evaluations.csv").read_bytes() == first
+    process = train(f"{longer} --resume")
+    assert process.returncode == 0, process.stderr
+    assert (folder / "evaluations.csv").read_bytes().startswith(first)
+    assert [row["step"] for row in read_evaluations(folder)] == list(range(512, 8193, 512))
+    assert json.loads((folder / "summary.json").read_text())["steps"] == 8192
+    assert json.loads((folder / "config.json").read_text())["args"]["total_timesteps"] == 8192
+    assert "complete" in train(f"{longer} --resume").stdout
+    assert_one_line_error(train(f"{tiny} --resume"), "8192, not 4096", code=2)
+    (folder / "checkpoint.pt").unlink()
+    even_longer = tiny.replace("4096", "9216") + " --resume"
+    assert_one_line_error(train(even_longer), "no checkpoint.pt", code=1)
+    assert len(read_evaluations(folder)) == 16
+
+
+def test_an_annealed_run_cannot_be_trained_longer(train, tiny, tmp_path):
+    assert train(f"{tiny} --anneal-lr").returncode == 0
+    longer = tiny.replace("4096", "8192") + " --anneal-lr --resume"
+    assert_one_line_error(train(longer), "--anneal-lr", "4096", code=2)
+
+
+def test_the_best_policy_is_kept(train, tiny, tmp_path):
+    """best.pt holds what was evaluated best: the first of equals, and the right parameters."""
+    flags = f"{tiny} --env-id Pendulum-v1 --learning-rate 0.05 --eval-episodes 5"
+    assert train(flags).returncode == 0
+    folder = only_run(tmp_path)
+    rows = read_evaluations(folder)
+    best_row = max(rows, key=lambda row: row["return_mean"])
+    assert best_row is not rows[-1]  # or this shows nothing
+    best = torch.load(folder / "best.pt", weights_only=True)
+    assert best["step"] == best_row["step"]
+    assert best["return_mean"] == pytest.approx(best_row["return_mean"], rel=1e-6)
+    agent = ppo.Agent(3, 1).requires_grad_(False)
+    agent.load_state_dict(best["agent"])
+    envs = environments.make_vector_env("Pendulum-v1", 5)
+    seeds = run_files.make_seeds(5, 1, 2, int(best["step"]))
+    returns, _ = ppo.evaluate(run_files.numpy_policy(agent.actor_mean), envs, seeds)
+    assert returns.mean() == pytest.approx(best["return_mean"], rel=1e-5)
+
+
+def test_the_best_policy_after_a_kill(train, tiny, tmp_path):
+    """One that was evaluated after the last checkpoint is lost with its evaluation."""
+    assert train(tiny).returncode == 0
+    folder = only_run(tmp_path)
+    (folder / "summary.json").unlink()
+    kept = torch.load(folder / "best.pt", weights_only=True)
+    torch.save(kept | {"return_mean": 1e9, "step": 10**9}, folder / "best.pt")
+    assert train(f"{tiny} --resume").returncode == 0
+    assert torch.load(folder / "best.pt", weights_only=True)["step"] == kept["step"]
+
+
+def test_beta_auto(train, tiny, tmp_path):
+    process = train(f"{tiny} --beta auto --n-steps 1024")
+    assert process.returncode == 0, process.stderr
+    assert "--beta auto is 0.163 here" in process.stdout
+    folder = only_run(tmp_path)
+    assert folder.parts[-3:] == ("beta_auto", "n_envs_2", "seed_1")
+    config = json.loads((folder / "config.json").read_text())["args"]
+    assert config["beta"] == [projected_beta(2, 1024)] and config["beta_auto"]
+    assert "complete" in train(f"{tiny} --beta auto --n-steps 1024").stdout
+    assert_one_line_error(train(f"{tiny} --beta auto 1"), "--beta auto is one number", code=2)
