@@ -38,9 +38,10 @@ without --retry-failed.
 Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
 """
 
-# The text above is the help of run_sweep.sh. What there is to run stands here, the paper's
-# experiments as lists of runs; how runs are carried out stands there. run_sweep.sh hands its
-# command line on, and prints the answer (--help, --print, --status) or works on the list it gets.
+# The text above is the help of run_sweep.sh. What there is to run stands here: the paper's
+# experiments as lists of runs, each a folder and a command. How they are carried out stands there:
+# run_sweep.sh hands its command line on to this file, and shows its answer to the user (--help,
+# --print, --status) or works on the list that it is.
 
 import argparse
 import itertools
@@ -52,7 +53,7 @@ import textwrap
 
 from environments import COMPLEX, NAMES
 
-GRID = {  # a run for each combination of these, where the preset says nothing else
+GRID = {  # a run for each combination, and what its words are where the preset says nothing else
     "seeds": [str(seed) for seed in range(1, 21)],
     "envs": [env_id for env_id in NAMES if env_id not in COMPLEX],
     "n_envs": ["4"],

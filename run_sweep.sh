@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Carries out the runs of a grid: each in a process of its own on one core, resumable, none twice.
-# Here stands how; which runs there are, the command line and the text of --help are in grids.py.
+# Carries out the paper's grids, each run in a process of its own on one core (--help tells the use).
+# How that is done stands here. Which runs there are, and the command line, stand in grids.py.
 
 ((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash 4.4 is needed" >&2; exit 2; }
 set -ufo pipefail # -f: words with * and ? stay as they are
@@ -14,17 +14,18 @@ unusable() { # script, what the interpreter said
   die "$python cannot run $1: ${2##*$'\n'}; PYTHON=... names the interpreter" 1
 }
 
-# What grids.py makes of the script's arguments: text for the user, or the list of runs, folders[i]
-# and commands[i], with what else its for_bash() lists.
+# What grids.py makes of the script's arguments: a text for the user, or an assignment of the runs,
+# folders[i] and commands[i], and of mode, preset, runs_dir and what else its for_bash() lists. It
+# is followed here by a line with its exit code and the last line of its stderr.
 ask_grids() {
-  local answer said code
-  answer=$( # its output, and as the last line its exit code and the last line of its errors
+  local answer end code said
+  answer=$(
     { said=$("$python" "$scripts/grids.py" "$@" 2>&1 >&3); } 3>&1
     printf '\n%s %s' $? "${said##*$'\n'}"
   )
-  said=$answer answer=${answer%$'\n'*}
-  said=${said:${#answer}+1}
-  code=${said%% *} said=${said#* }
+  end=$answer answer=${answer%$'\n'*}
+  end=${end:${#answer}+1}
+  code=${end%% *} said=${end#* }
   ((code != 2)) || die "$said" 2
   ((code == 0)) || unusable grids.py "$said"
   [[ -z $said ]] || echo "$said" >&2
