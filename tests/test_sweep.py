@@ -6,6 +6,7 @@ REQUIRE_SLURM=1.
 
 import contextlib
 import fcntl
+import functools
 import json
 import os
 import random
@@ -21,6 +22,10 @@ from pathlib import Path
 
 import pytest
 
+import grids
+import ppo_colored_continuous
+import run_files
+
 ROOT = Path(__file__).parent.parent
 SWEEP = str(ROOT / "run_sweep.sh")
 ENV = {**os.environ, "PYTHON": sys.executable}
@@ -32,7 +37,9 @@ FLAGS = ["--env-id", "--beta", "--n-envs", "--seed", "--exp-name"]
 # Stands for python where only what the sweep makes of a run counts, so that this is quick
 FAKE_PYTHON = f"""#!{sys.executable} -S
 import os, sys, time
-if "--help" not in sys.argv:
+if sys.argv[1].endswith("grids.py"):
+    os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+elif "--help" not in sys.argv:
     folder = os.path.dirname(os.readlink("/proc/self/fd/1"))
     exec(os.environ["FAKE_RUN"])
 """
@@ -217,6 +224,25 @@ def test_any_environment():
     ]
     ids = ["dm_control/cheetah-run-v0", "Ant4Rooms-v1", "HalfCheetah-v5", "my_env:Mine"]
     assert [w[3] for w in words] == [*ids, "my_env:Mine-v0"]
+
+
+def test_folders_are_those_of_the_runs():
+    mix = "--envs 'door reacher-hard my:Env MyEnv-v0' --betas '-.50 -0 2.0' --exp-name x --seeds 0"
+    sweeps = [f"{preset} {mix}" for preset in ("main", "n_steps", "n_epochs", "transfer")]
+    for sweep_args in [*sweeps, "vanilla", "gsde", "quick --runs-dir '/a b/'"]:
+        runs = grids.list_runs(grids.parse_args(shlex.split(sweep_args)))
+        for folder, command in random.Random(1).sample(runs, k=4):
+            _, script, *argv = shlex.split(command)
+            parse = ppo_colored_continuous.parse_args
+            if script.endswith("baselines.py"):
+                parse = functools.partial(parse, method=argv.pop(0))
+            assert folder == str(run_files.run_path(vars(parse(argv)))), command
+
+
+def test_beta_auto():
+    args = grids.parse_args(["quick", "--betas", "auto 0", "--seeds", "1"])
+    (folder, command), _ = grids.list_runs(args)
+    assert "/beta_auto/" in folder and " --beta auto " in command
 
 
 def test_n_steps_keeps_the_update_size():
