@@ -294,9 +294,7 @@ def make_envs(args):
     envs = NormalizedVectorEnv(envs, args.normalize_obs, args.normalize_rewards, args.gamma)
     if args.normalize_obs:
         eval_envs = envs.frozen(eval_envs)
-        if video_env:
-            space = video_env.observation_space
-            video_env = gym.wrappers.TransformObservation(video_env, envs.normalized, space)
+        video_env = video_env and envs.frozen_single(video_env)
     return envs, eval_envs, video_env, envs
 
 
@@ -333,6 +331,14 @@ class NormalizedVectorEnv(VectorWrapper):
         other = NormalizedVectorEnv(env)
         other._statistics, other._training = {"obs": self._statistics["obs"]}, False
         return other
+
+    def frozen_single(self, env):
+        """The same, for one environment that is no vector."""
+
+        def normalized(obs):  # the wrapper makes a deep copy, of a method with all that is its own
+            return self.normalized(obs)
+
+        return gym.wrappers.TransformObservation(env, normalized, env.observation_space)
 
     def normalized(self, obs):
         statistics = self._statistics["obs"]
@@ -646,12 +652,18 @@ class EnvPoolVectorEnv(VectorEnv):
         return state
 
 
+def is_headless():
+    """Whether there is no display to show a window on."""
+    displays = ("DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform == "linux" and not any(os.environ.get(name) for name in displays)
+
+
 def make_render_env(env_id, **options):
     """Makes one environment that renders frames without a display; options as make_env has them.
 
     Raises gymnasium.error.Error where it cannot, and otherwise as make_env does.
     """
-    if not os.environ.get("DISPLAY"):
+    if is_headless():
         os.environ.setdefault("MUJOCO_GL", "egl")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains without sound
@@ -687,15 +699,20 @@ def frames_per_second(env):
     return 1 / dt if dt else env.metadata.get("render_fps") or 30
 
 
+def video_file(path, env):
+    """Opens a new video at the speed of env's task; append_data(frame) adds to it."""
+    import imageio
+
+    return imageio.get_writer(path, fps=frames_per_second(env), macro_block_size=2)
+
+
 @preserved_generators()
 def record_video(env, policy, path, seed):
     """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim), and saves it."""
-    import imageio
-
     path.parent.mkdir(exist_ok=True)
     obs, _ = env.reset(seed=seed)
     done = False
-    with imageio.get_writer(path, fps=frames_per_second(env), macro_block_size=2) as video:
+    with video_file(path, env) as video:
         while not done:
             video.append_data(env.render())
             action = np.clip(policy(obs[None])[0], env.action_space.low, env.action_space.high)
