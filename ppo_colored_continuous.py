@@ -137,7 +137,7 @@ class Agent(nn.Module):
         Returns logprobs (batch,), entropy () and values (batch,).
         """
         # The density of a single step. That eps is correlated over time does not enter: each eps is
-        # still Gaussian by itself, and PPO's objective is made of single steps (README, questions).
+        # still Gaussian by itself, and PPO's objective is made of single steps (docs/lesson.md).
         z = (actions - self.actor_mean(obs)) / self.log_std.exp()
         logprobs = (-0.5 * z**2 - self.log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
         entropy = (0.5 + 0.5 * math.log(2 * math.pi) + self.log_std).sum()

@@ -273,7 +273,7 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
 
 @pytest.mark.parametrize(
     ("readme", "data"),
-    [("README.md", "reproduction.csv"), ("results/README.md", "bootstrapped_timeouts.csv")],
+    [("results/README.md", "reproduction.csv"), ("results/README.md", "bootstrapped_timeouts.csv")],
 )
 def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data):
     runs, _ = analysis.select(analysis.load([ROOT / "results" / data])[0])

@@ -374,7 +374,7 @@ def test_without_a_compiler_it_says_so_once_and_goes_on(train, tiny, tmp_path):
 @pytest.mark.parametrize("env_id", ["MountainCarContinuous-v0", "dm_control/pendulum-swingup-v0"])
 def test_capture_video_without_a_display(train, tiny, tmp_path, env_id):
     if env_id.startswith("dm_control") and not ctypes.util.find_library("EGL"):
-        pytest.skip("no EGL here, see the README on videos")
+        pytest.skip("no EGL here, see docs/environments.md on videos")
     unset = dict.fromkeys(["DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL", "SDL_VIDEODRIVER"])
     flags = f"{tiny} --capture-video --eval-freq 400 --env-id {env_id} --max-episode-steps 100"
     process = train(flags, env=unset)
