@@ -3,6 +3,8 @@
     python plot.py noise           what the noise looks like: nothing needs to be trained
     python plot.py results runs/   figures and tables of all complete runs, in folders or packed
     python plot.py environments    a frame of each of the paper's environments
+    python plot.py animation       policies that have learned nothing, in Mountain Car: only the
+                                   color of their noise differs
 
 Sections named below are those of Hollenstein, Martius, Piater: "Colored Noise in PPO", AAAI 2024,
 with its appendix.
@@ -17,6 +19,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, NullLocator
@@ -26,9 +29,17 @@ from tqdm import tqdm
 import analysis
 import claims
 from analysis import CELL, STUDY_BETAS, Unusable, beta_text, comparable, need
-from colored_noise import autocovariance, colored_noise, expected_psd, marginal_variance, mean_std
-from environments import COMPLEX, NAMES, make_render_env, silence
-from run_files import fail
+from colored_noise import (
+    ColoredNoiseProcess,
+    autocovariance,
+    colored_noise,
+    expected_psd,
+    marginal_variance,
+    mean_std,
+)
+from environments import COMPLEX, NAMES, make_render_env, make_vector_env, silence
+from ppo_colored_continuous import Agent
+from run_files import fail, numpy_policy
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -151,7 +162,7 @@ def draw_noise(beta, *size):
 
 def random_walks(betas):
     """Fig. 1: two-dimensional random walks."""
-    fig, axes = plt.subplots(2, len(betas), figsize=(1.45 * len(betas) + 0.5, 3.7), squeeze=False)
+    fig, axes = plt.subplots(2, len(betas), figsize=(1.45 * len(betas) + 0.5, 3.3), squeeze=False)
     walks = [draw_noise(beta, 4, 2).cumsum(-1).numpy() for beta in betas]  # each (walks, xy, steps)
     for beta, column, walk in zip(betas, axes.T, walks, strict=True):
         for ax, shown in zip(column, (walks, walk), strict=True):
@@ -500,6 +511,58 @@ def contact_sheet():
     return fig
 
 
+def untrained_positions(beta, n_cars=50, n_steps=999, seed=1):
+    """Plays Mountain Car with a policy that has learned nothing, exploring as in training.
+
+    Returns the positions of n_cars cars, (n_steps + 1, n_cars); at the goal they stay there.
+    """
+    torch.manual_seed(seed)
+    policy = numpy_policy(Agent(2, 1).requires_grad_(False).actor_mean)  # its std is 1
+    noise = ColoredNoiseProcess(beta, n_cars, 1, seed=seed).sample(n_steps).numpy()
+    envs = make_vector_env("MountainCarContinuous-v0", n_cars)
+    obs, _ = envs.reset(seed=[seed + i for i in range(n_cars)])
+    positions, running = [obs[:, 0].copy()], np.ones(n_cars, bool)
+    for eps in noise:
+        obs, _, terminated, truncated, infos = envs.step(np.clip(policy(obs) + eps, -1, 1))
+        ended = running & (terminated | truncated)
+        running &= ~ended
+        positions.append(np.where(running, obs[:, 0], positions[-1]))
+        for i in np.flatnonzero(ended):
+            positions[-1][i] = infos["final_obs"][i][0]
+    return np.array(positions)
+
+
+def animation(betas, n_frames=100, **cars):
+    """`untrained_positions` of each beta on the hill, as frames over an episode of 999 steps."""
+    goal, runs = 0.45, [untrained_positions(beta, **cars) for beta in betas]
+    hill, n_steps = np.linspace(-1.2, 0.6, 200), len(runs[0]) - 1
+    rng = np.random.default_rng(0)
+    lift = 0.04 + 0.14 * rng.random(runs[0].shape[1])  # apart from each other, to be seen
+    fig, axes = plt.subplots(1, len(betas), figsize=(2.6 * len(betas), 2.1), squeeze=False)
+    dots, titles = [], []
+    for ax, beta in zip(axes[0], betas, strict=True):
+        ax.fill_between(hill, 0.45 * np.sin(3 * hill) + 0.55, color="0.85", lw=0)
+        ax.plot([goal] * 2, [0.99, 1.3], color=INK, lw=1.5)
+        ax.fill([goal, goal, goal + 0.12], [1.3, 1.18, 1.24], color="#D55E00", lw=0)
+        dots += ax.plot([], [], "o", color=color(beta), ms=3.5, alpha=0.7, mew=0)
+        titles.append(ax.set_title("\n"))
+        ax.set(xlim=(-1.2, 0.62), ylim=(0, 1.4), xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+
+    def draw(frame):
+        step = min(round(n_steps * frame / (n_frames - 1)), n_steps)
+        for beta, positions, dot, title in zip(betas, runs, dots, titles, strict=True):
+            x, there = positions[step], (positions[step] >= goal).sum()
+            dot.set_data(x, 0.45 * np.sin(3 * x) + 0.55 + lift)
+            name = {0: " (white)", 1: " (pink)", 2: " (red)"}.get(beta, "")
+            name = f"$\\beta = {beta:g}${name}, step {step}"
+            title.set_text(f"{name}\nat the goal: {there} of {len(x)}")
+        return [*dots, *titles]
+
+    pause = [n_frames - 1] * 25
+    return FuncAnimation(fig, draw, [*range(n_frames), *pause], blit=False)
+
+
 # --- Output ---------------------------------------------------------------------------------------
 
 
@@ -604,7 +667,8 @@ def parse_args():
     noise = commands.add_parser("noise", help="figures of the noise")
     results = commands.add_parser("results", help="figures and tables of runs")
     sheet = commands.add_parser("environments", help="a frame of each of the paper's environments")
-    for each in (parser, noise, results, sheet):
+    cars = commands.add_parser("animation", help="untrained policies in Mountain Car, a GIF")
+    for each in (parser, noise, results, sheet, cars):
         each.error = lambda message: fail(f"{message} (--help lists the arguments)", code=2)
     analysis.add_runs(results)
     results.add_argument("--method", default="ppo", help="which method's runs (default: ppo)")
@@ -613,8 +677,10 @@ def parse_args():
     for command in (noise, results):
         folder = "for figures and tables; those of an earlier command are replaced or removed"
         command.add_argument("--out", type=Path, default=Path("figures"), help=f"folder {folder}")
-    picture = {"default": Path("results/environments.png"), "help": "the picture's file"}
-    sheet.add_argument("--out", type=Path, **picture)
+    cars.add_argument("--beta", nargs="+", type=analysis.finite, default=[0.0, 0.5, 1.0])
+    for command, name in ((sheet, "environments.png"), (cars, "animation.gif")):
+        picture = {"default": Path("results") / name, "help": "the picture's file"}
+        command.add_argument("--out", type=Path, **picture)
     return parser.parse_args()
 
 
@@ -668,10 +734,14 @@ def main():
         made, _ = make_all(noise(sorted({beta + 0.0 for beta in args.beta})), args.out)
         print(f"{args.out}: {', '.join(made)}")
     else:
-        if args.out.suffix[1:] not in FigureCanvasBase.filetypes or not args.out.parent.is_dir():
+        types = ["gif"] if args.command == "animation" else FigureCanvasBase.filetypes
+        if args.out.suffix[1:] not in types or not args.out.parent.is_dir():
             raise Unusable(f"--out {args.out} is not a picture's name in a folder that exists")
         silence()
-        contact_sheet().savefig(args.out, dpi=85)
+        if args.command == "animation":
+            animation(args.beta).save(args.out, PillowWriter(fps=15), dpi=100)
+        else:
+            contact_sheet().savefig(args.out, dpi=85)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
 """plot.py: every figure of a small real sweep, and what it does with incomplete data."""
 
+import argparse
 import subprocess
 import sys
 
+import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from conftest import ROOT, SCRIPT
 from PIL import Image
 from test_analysis import CAR, PENDULUM, PUSH, select, write_run, write_sweep
@@ -14,7 +17,10 @@ from test_analysis import run_file as run_file  # the fixture `run`
 
 import analysis
 import plot
+import ppo_colored_continuous as ppo
+from colored_noise import ColoredNoiseProcess
 from environments import NAMES
+from run_files import numpy_policy
 
 NOISE = {"noise_random_walks", "noise_psd", "noise_two_step", "noise_marginal", "noise_bias"}
 TABLES = {
@@ -500,3 +506,37 @@ def test_the_coverage_of_the_measured_results(tmp_path, run):
         said.runs["beta 0.5 is best on average"]
         == f"{len(select(ROOT / 'results' / 'reproduction.csv'))} of 20480"
     )
+
+
+def test_untrained_cars_are_those_of_a_first_rollout():
+    """Stepped by hand in Gymnasium, with the script's own exploration(); at the goal they stay."""
+    positions = plot.untrained_positions(0.5, n_cars=3, n_steps=200, seed=4)
+    torch.manual_seed(4)
+    agent = ppo.Agent(2, 1).requires_grad_(False)
+    args = argparse.Namespace(n_steps=200, n_envs=3, vanilla=False)
+    noise = ColoredNoiseProcess(0.5, 3, 1, seed=4)
+    act = ppo.exploration(agent, numpy_policy(agent.actor_mean), noise, args)
+    envs = [gym.make("MountainCarContinuous-v0") for _ in range(3)]
+    obs = np.array([env.reset(seed=4 + i)[0] for i, env in enumerate(envs)])
+    for t in range(200):
+        np.testing.assert_allclose(positions[t], obs[:, 0], atol=1e-6)
+        actions = np.clip(act(obs, t), -1, 1)
+        obs = np.array([env.step(a)[0] for env, a in zip(envs, actions, strict=True)])
+    assert positions.shape == (201, 3)
+    positions = plot.untrained_positions(1, n_cars=20)
+    there = positions >= 0.45
+    assert there.any() and (np.diff(there.astype(int), axis=0) >= 0).all()
+
+
+def test_the_animation(tmp_path):
+    """What results/animation.gif shows, and that it plays on and on."""
+    with Image.open(ROOT / "results" / "animation.gif") as gif:
+        assert gif.n_frames == 100 and gif.info["loop"] == 0
+        assert sum(gif.seek(i) or gif.info["duration"] for i in range(100)) < 10_000  # ms
+    assert (ROOT / "results" / "animation.gif").stat().st_size < 1e6
+    movie = plot.animation([0, 1], n_frames=3)
+    movie.save(tmp_path / "x.gif", plot.PillowWriter(fps=15))
+    white, pink = (ax.get_title() for ax in movie._fig.axes)
+    assert white.endswith("(white), step 999\nat the goal: 1 of 50")
+    assert pink.endswith("(pink), step 999\nat the goal: 39 of 50")
+    plt.close(movie._fig)
