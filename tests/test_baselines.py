@@ -14,6 +14,7 @@ from test_runs import only_run, read_evaluations, read_events, start, wait_for_r
 import baselines
 import ppo_colored_continuous as ppo
 import run_files
+from environments import make_vector_env
 
 SIZE = N_STEPS * N_ENVS
 
@@ -186,7 +187,7 @@ def test_the_evaluated_policy_of_gsde_has_no_noise(tmp_path):
     assert folder.parts[-5:-2] == ("gsde", "Pendulum-v1", "gsde")
     agent = baselines.GSDEAgent(3, 1).requires_grad_(False)
     agent.load_state_dict(torch.load(folder / "checkpoint.pt", weights_only=True)["agent"])
-    envs = ppo.make_vector_env("Pendulum-v1", 2)
+    envs = make_vector_env("Pendulum-v1", 2)
     mean = lambda obs: agent.actor_mean(torch.tensor(obs)).numpy()  # noqa: E731
     returns, _ = ppo.evaluate(mean, envs, run_files.make_seeds(2, 1, 2, 1024))
     assert read_evaluations(folder)[0]["return_mean"] == pytest.approx(returns.mean(), rel=1e-3)

@@ -494,13 +494,13 @@ def test_the_coverage_of_the_measured_results(tmp_path, run):
     assert table.runs.str.fullmatch(r"\d+ of \d+|none needed").all()
     presets = set(" ".join(table.command).replace(";", "").split("run_sweep.sh "))
     presets = {command.split()[0] for command in presets if "python plot.py results" in command}
-    help_text = (ROOT / "run_sweep.sh").read_text()
+    help_text = (ROOT / "grids.py").read_text()
     known = plot.results(dict(ppo=select(ROOT / "results" / "reproduction.csv")), None)
     known = {*known, *NOISE, "results/environments.png", "learning_curves_n_envs_*"}
     known |= {"learning_curves_mountain_car"}
     assert set(table.file) <= known
     for preset in presets:
-        assert f"#   {preset} " in help_text, preset
+        assert f"\n  {preset} " in help_text, preset
     said = table.set_index("says")
     assert (
         said.runs["beta 0.5 is best on average"]
