@@ -242,7 +242,8 @@ def unknown_id_message(env_id, name):
     matches = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.4)
     message = f"unknown environment {env_id}"
     if matches:
-        message += f"; did you mean {' or '.join(matches)}?"
+        module = env_id.removesuffix(name)  # with its colon, or nothing
+        message += f"; did you mean {' or '.join(module + match for match in matches)}?"
     if name == env_id:
         message += f" (one that your my_env.py or a package registers: my_env:{name})"
     return message

@@ -14,8 +14,9 @@ from conftest import ROOT
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 
+import claims
 import ppo_colored_continuous as ppo
-from analysis import final_return_per_beta, final_returns, load, select
+from analysis import final_return_per_beta, final_returns, load, select_methods
 from colored_noise import PUBLISHED_BEST_BETA, autocovariance, projected_beta
 
 README = (ROOT / "README.md").read_text()
@@ -189,8 +190,9 @@ def test_which_beta():
 def test_the_table_of_agreement_is_the_data():
     text = section(README, "What agrees with the paper, and what does not")
     data = [ROOT / "results" / name for name in ("reproduction.csv", "study.csv")]
-    runs, _ = select(load(data)[0])
-    table = final_return_per_beta(final_returns(runs)).astype(str)
+    loaded, curves = load(data)
+    methods, _ = select_methods(loaded)
+    table = final_return_per_beta(final_returns(methods["ppo"])).astype(str)
     cells = table.set_index(["environment", "n_envs"])
     for place, beta, numbers in (
         (("Pendulum Swingup", "4"), "beta 1", "103 [39, 126]"),
@@ -200,12 +202,16 @@ def test_the_table_of_agreement_is_the_data():
         measured = re.findall(r"[\d.]+", cells.loc[place, beta])
         said = re.findall(r"\d+", numbers)
         assert numbers in text and [f"{float(x):.0f}" for x in measured] == said
-    of_five = final_returns(runs).query("runs == 5 and paper.notna()")
-    outside = (of_five.in_interval == "no").sum()
-    assert (
-        f"| {len(of_five)} cells of five seeds, published mean outside our interval | {outside} |"
-        in text
+    verdicts = claims.coverage(methods, curves).set_index("says").data
+    outside, of = re.match(r"(\d+) of (\d+)", verdicts["final returns"]).groups()
+    expected = re.search(r"([\d.]+) expected", verdicts["final returns"])[1]
+    assert f"| {of} cells: published mean outside our interval | {outside} |" in text
+    assert f"{expected} expected" in text
+    lead = re.search(
+        r"over 0 (\S+ \[\S+, \S+\]) \((\d+)", verdicts["beta 0.5 outperforms white noise"]
     )
+    standard_deviations = lead[1].replace(" ", " standard deviations ", 1)
+    assert f"ahead of white, {lead[2]} environments | {standard_deviations} |" in text
 
 
 def test_sweep_in_three_commands(tmp_path):

@@ -60,7 +60,7 @@ def run(code, folder):
         ("0123456789", ["unknown environment 0123456789"]),
         ("no_such_module:Mine-v0", ["no no_such_module.py in the current folder"]),
         ("no_such.module:Mine-v0", ["no package no_such.module"]),
-        ("mazes:PointUMazes-v1", ["mazes:PointUMazes-v1; did you mean PointUMaze-v1"]),
+        ("mazes:PointUMazes-v1", ["mazes:PointUMazes-v1; did you mean mazes:PointUMaze-v1"]),
         ("a:b:c", ["no a:b.py"]),
         ("CartPole-v1", ["Discrete(2)"]),
         ("Pendulum-v0", ["deprecated"]),
