@@ -28,7 +28,7 @@ how to run it
   --slurm             submit what is to do as job arrays
   --sbatch "OPTIONS"  for sbatch: "--partition=cpu --time=12:00:00 --mem-per-cpu=2G"; with
                       --cpus-per-task=8 a task does its runs 8 at a time
-  --runs-per-task K   runs in a task of the array (4; 1 for the ant, which takes over an hour)
+  --runs-per-task K   runs in a task of the array (4; 1 for the ant, which takes longest)
 
 PYTHON names the interpreter (python), as in PYTHON=.venv/bin/python ./run_sweep.sh quick
 Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was. On a
