@@ -282,9 +282,10 @@ def env_options(args):
 
 
 def make_envs(args):
-    """Makes a run's environments: to train in, to evaluate in, and one to film, or None.
+    """Makes a run's environments.
 
-    And what has a state_dict, the normalization's. Raises as make_env does.
+    Returns envs to train in, envs to evaluate in, an environment to film or None, and the
+    normalization, of which the state_dict belongs to the policy. Raises as make_env does.
     """
     options = env_options(args)
     video_env = make_render_env(args.env_id, **options) if args.capture_video else None
