@@ -211,7 +211,8 @@ def read_packed(path):
 def load(paths, env=None, beta=None, n_envs=None):
     """Reads the runs in folders and in files that `pack` wrote; keeps those that are asked for.
 
-    env, beta, n_envs: lists, or None for all: ids or names in the paper, beta as text.
+    env, beta, n_envs: lists, or None for all: ids, short as in cheetah-run or not, or names in the
+        paper; beta as text.
 
     Returns:
         runs: a row per run, whatever its state; columns as in `read_run`, `source` and `path`
@@ -243,6 +244,8 @@ def load(paths, env=None, beta=None, n_envs=None):
     curves = curves.sort_index(axis=1)
     runs["performance"] = curves.mean(axis=1)
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1] if len(curves.columns) else np.nan
+    short = {re.sub(r"^dm_control/|-v\d+$", "", x): x for x in runs.env_id.dropna().unique()}
+    env = env and [short.get(value, value) for value in env]
     keep = pd.Series(True, runs.index)
     for flag, wanted in (("env", env), ("beta", beta), ("n_envs", n_envs)):
         columns = ["environment", "env_id"] if flag == "env" else [flag]

@@ -116,6 +116,8 @@ def test_load_gives_settings_performance_and_curves(tmp_path):
     chosen = select(tmp_path).set_index("environment")
     assert chosen.beta["Pendulum Swingup"] == -1 and np.isnan(chosen.beta["Unknown-v0"])
     assert chosen.vanilla.to_dict() == {"Pendulum Swingup": False, "Unknown-v0": True}
+    for name in ("pendulum-swingup", PENDULUM, "Pendulum Swingup", "Unknown", "Unknown-v0"):
+        assert len(analysis.load([tmp_path], env=[name])[0]) == 1
 
 
 def test_all_environments_of_the_paper_have_its_names():

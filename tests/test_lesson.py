@@ -48,10 +48,11 @@ def test_look_at_noise():
 def test_why_it_works():
     """With three of the twenty seeds."""
     text = section(LESSON, "3. Why it works")
-    lines = printed(blocks(text, "python")[0].replace("range(1, 21)", "range(1, 4)")).splitlines()
-    found = [int(line.split(" in ")[1].split(" of ")[0]) for line in lines]
-    assert found == [0, 3, 3, 3]
-    assert [row[2] for row in table(text)] == ["1 of 20", *["20 of 20"] * 3]
+    code, spectrum = blocks(text, "python")
+    lines = printed(code.replace("range(1, 21)", "range(1, 4)")).splitlines()
+    assert [int(re.search(r"found in (\d+)", line)[1]) for line in lines] == [0, 3, 3, 3]
+    power = [float(line.split()[1]) for line in printed(spectrum).splitlines()]
+    assert power == [1.0, 3.1, 5.3, 1.6] and "White 1.0, then 3.1, pink 5.3, red 1.6" in text
 
 
 def hunks(diff):
