@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Carries out the paper's grids, each run in a process of its own on one core (--help tells the use).
+# Carries out the paper's grids, each run in a process of its own on one core (--help says how).
 # How that is done stands here. Which runs there are, and the command line, stand in grids.py.
 
 ((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash 4.4 is needed" >&2; exit 2; }

@@ -118,7 +118,10 @@ def test_one_beta_per_action_dimension():
 
 def test_process_continues_over_the_ends_of_sequences():
     """The same values come out one by one and in blocks of any length, across redraws."""
-    make = lambda: ColoredNoiseProcess(0.5, n_envs=2, action_dim=3, seq_len=10, seed=3)  # noqa: E731
+
+    def make():
+        return ColoredNoiseProcess(0.5, n_envs=2, action_dim=3, seq_len=10, seed=3)
+
     one, block = make(), make()
     singles = torch.stack([one.sample() for _ in range(35)])
     blocks = torch.cat([block.sample(n) for n in (4, 6, 25)])
