@@ -26,7 +26,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from colored_noise import mean_std
-from environments import NAMES
+from environments import NAMES, id_named
 from run_files import ABSENT, FREE_ARGS, fail
 
 try:
@@ -244,8 +244,7 @@ def load(paths, env=None, beta=None, n_envs=None):
     curves = curves.sort_index(axis=1)
     runs["performance"] = curves.mean(axis=1)
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1] if len(curves.columns) else np.nan
-    short = {re.sub(r"^dm_control/|-v\d+$", "", x): x for x in runs.env_id.dropna().unique()}
-    env = env and [short.get(value, value) for value in env]
+    env = env and [id_named(value, runs.env_id.dropna().unique()) or value for value in env]
     keep = pd.Series(True, runs.index)
     for flag, wanted in (("env", env), ("beta", beta), ("n_envs", n_envs)):
         columns = ["environment", "env_id"] if flag == "env" else [flag]

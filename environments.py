@@ -249,6 +249,12 @@ def unknown_id_message(env_id, name):
     return message
 
 
+def id_named(word, ids):
+    """The one of the ids that the word names, in full or short as cheetah-run; None if none is."""
+    pattern = rf"(dm_control/)?{re.escape(word)}(-v\d+)?"
+    return next((env_id for env_id in ids if re.fullmatch(pattern, env_id)), None)
+
+
 def is_from_dm_control_suite(name):
     entry_point = getattr(gym.registry.get(name), "entry_point", None)
     return "domain_name" in getattr(entry_point, "keywords", {})
@@ -397,11 +403,11 @@ def make_vector_env(env_id, n_envs, envpool=False, threads=1, **options):
     episodes instead.
 
     With envpool they are EnvPool's. Up to `threads` threads step them where that helps, with the
-    same results. options: as make_env has them, of which EnvPool's take none.
+    same results. options: as make_env has them. EnvPool's take none; their actions are scaled.
     Raises as make_env does.
     """
     if envpool:
-        if options.get("max_episode_steps") is not None or options.get("env_kwargs"):
+        if changes_task(**options):
             raise gym.error.Error(
                 f"EnvPool's {env_id} is as it is: --max-episode-steps and --env-kwargs need "
                 "--no-envpool"
@@ -493,10 +499,14 @@ class ThreadedVectorEnv(VectorEnv):
             part.close()
 
 
+def changes_task(max_episode_steps=None, env_kwargs=None, **others):
+    """Whether options of make_env make another task of it than EnvPool has."""
+    return max_episode_steps is not None or bool(env_kwargs)
+
+
 def envpool_suits(args):
     """Whether EnvPool is installed and has a run's task as its arguments say."""
-    changed = args.max_episode_steps is not None or args.env_kwargs
-    return envpool_has(args.env_id) and not changed
+    return envpool_has(args.env_id) and not changes_task(**env_options(args))
 
 
 def envpool_has(env_id):
@@ -708,15 +718,26 @@ def video_file(path, env):
     return imageio.get_writer(path, fps=frames_per_second(env), macro_block_size=2)
 
 
-@preserved_generators()
-def record_video(env, policy, path, seed):
-    """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim), and saves it."""
-    path.parent.mkdir(exist_ok=True)
+def play(env, policy, seed, video=None):
+    """Plays an episode of policy(obs (1, obs_dim)) -> actions (1, action_dim), and films it.
+
+    Yields the reward of each step.
+    """
     obs, _ = env.reset(seed=seed)
     done = False
-    with video_file(path, env) as video:
-        while not done:
+    while not done:
+        if video:
             video.append_data(env.render())
-            action = np.clip(policy(obs[None])[0], env.action_space.low, env.action_space.high)
-            obs, _, terminated, truncated, _ = env.step(action)
-            done = terminated or truncated
+        action = np.clip(policy(obs[None])[0], env.action_space.low, env.action_space.high)
+        obs, reward, terminated, truncated, _ = env.step(action)
+        done = terminated or truncated
+        yield reward
+
+
+@preserved_generators()
+def record_video(env, policy, path, seed):
+    """Plays an episode of the policy, as `play` has it, and saves a video of it."""
+    path.parent.mkdir(exist_ok=True)
+    with video_file(path, env) as video:
+        for _ in play(env, policy, seed, video):
+            pass

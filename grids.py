@@ -51,7 +51,7 @@ import shlex
 import sys
 import textwrap
 
-from environments import COMPLEX, NAMES
+from environments import COMPLEX, NAMES, id_named
 
 GRID = {  # a run for each combination, and what its words are where the preset says nothing else
     "seeds": [str(seed) for seed in range(1, 21)],
@@ -94,9 +94,8 @@ def words(parse):
 
 def full_id(word):
     """The id behind a short name such as cheetah-run, and any other id as it is."""
-    for env_id in NAMES:
-        if re.fullmatch(rf"(dm_control/)?{re.escape(word)}(-v[0-9])?", env_id):
-            return env_id
+    if env_id := id_named(word, NAMES):
+        return env_id
     if not re.search(r":|-v[0-9]+$", word):
         raise argparse.ArgumentTypeError(f"'{word}' is no environment")
     return matching("[A-Za-z0-9_./:-]+")(word)

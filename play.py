@@ -29,22 +29,17 @@ import run_files
 from colored_noise import ColoredNoiseProcess
 from run_files import fail, stop_if_asked
 
-MAX_STEPS = 10_000
-
 
 def parse_args(argv=None):
     formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=formatter, allow_abbrev=False
-    )
+    parser = run_files.ArgumentParser(description=__doc__, formatter_class=formatter)
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run, with config.json and checkpoint.pt")
-    count, real, whole = (run_files.NUMBERS[name] for name in ("count", "real", "whole"))
-    add("--episodes", type=count, help="how many (10; 1 with --video)")
+    add("--episodes", type="count", help="how many (10; 1 with --video)")
     add("--best", action="store_true", help="the policy that was evaluated best, not the last one")
-    add("--beta", type=real, nargs="+", help="explore with noise of this color, or these; without, "
-        "the mean action")  # fmt: skip
-    add("--seed", type=whole, default=1, help="of the environment and the noise (1)")
+    add("--beta", type="real", nargs="+", help="explore with noise of this color, or these; else "
+        "it is the mean action")  # fmt: skip
+    add("--seed", type="whole", default=1, help="of the environment and the noise (1)")
     shown = parser.add_mutually_exclusive_group().add_argument
     shown("--window", action="store_true", help="show it on the screen, at the speed of the task")
     shown("--video", type=Path, metavar="FILE", help="write it to this file, name.mp4")
@@ -96,35 +91,31 @@ def make_env(run_args, state, args):
 
 
 def make_policy(acting, env, args, gsde=False):
-    """Returns act(obs (obs_dim,)) -> action (action_dim,): the mean, plus noise with --beta."""
+    """Returns policy(obs (1, obs_dim)) -> actions (1, action_dim): the mean, or with noise."""
     action_dim = env.action_space.shape[0]
     make_agent = baselines.GSDEAgent if gsde else ppo.Agent
     agent = make_agent(env.observation_space.shape[0], action_dim).requires_grad_(False)
     agent.load_state_dict(acting["agent"])
     policy = run_files.numpy_policy(agent.actor_mean)
     if not args.beta:
-        return lambda obs: policy(obs[None])[0]
+        return policy
     if gsde:
         fail("--beta: a gSDE policy has noise of its own, without a color", 2)
     if len(args.beta) not in (1, action_dim):
         fail(f"--beta has {len(args.beta)} values, the run {action_dim} action dimensions", 2)
     noise, std = ColoredNoiseProcess(args.beta, 1, action_dim, seed=args.seed), agent.log_std.exp()
-    return lambda obs: policy(obs[None])[0] + (std * noise.sample(1)[0, 0]).numpy()
+    return lambda obs: policy(obs) + (std * noise.sample()).numpy()
 
 
-def play(env, act, seed, video=None):
-    """Plays an episode, and films it. Returns (return, length)."""
-    (obs, _), total = env.reset(seed=seed), 0.0
-    for length in range(1, MAX_STEPS + 1):
+def play(env, policy, seed, video, max_steps):
+    """Plays an episode. Returns (return, length)."""
+    rewards = []
+    for reward in environments.play(env, policy, seed, video):
         stop_if_asked()
-        if video:
-            video.append_data(env.render())
-        action = np.clip(act(obs), env.action_space.low, env.action_space.high)
-        obs, reward, terminated, truncated, _ = env.step(action)
-        total += reward
-        if terminated or truncated:
-            return total, length
-    fail(f"no end of an episode after {MAX_STEPS} steps")
+        if len(rewards) == max_steps:
+            fail(f"no end of an episode after {max_steps} steps")
+        rewards.append(reward)
+    return sum(rewards), len(rewards)
 
 
 def main(args):
@@ -133,19 +124,18 @@ def main(args):
     with run_files.one_line_for(gym.error.Error):
         env = make_env(run_args, acting["normalization"], args)
     with run_files.one_line_for(RuntimeError, because=f"the policy in {args.run} does not fit: "):
-        act = make_policy(acting, env, args, gsde=run_args.method == "gsde")
+        policy = make_policy(acting, env, args, gsde=run_args.method == "gsde")
     noise = f"noise of beta {' '.join(f'{b:g}' for b in args.beta)}" if args.beta else "no noise"
     print(f"{run_args.env_id}, the policy after {acting['step']:,} steps, {noise}")
-    results = np.zeros((args.episodes, 2))
-    errors = [OSError] if args.video else []
-    with (
-        run_files.one_line_for(*errors, because=f"cannot write {args.video}: "),
-        environments.video_file(args.video, env)
-        if args.video
-        else contextlib.nullcontext() as video,
-    ):
+    results, max_steps = np.zeros((args.episodes, 2)), run_args.max_episode_steps or 10_000
+    with contextlib.ExitStack() as stack:
+        video = None
+        if args.video:
+            because = f"cannot write {args.video}: "
+            stack.enter_context(run_files.one_line_for(OSError, because=because))
+            video = stack.enter_context(environments.video_file(args.video, env))
         for i in range(args.episodes):
-            results[i] = play(env, act, args.seed + i, video)
+            results[i] = play(env, policy, args.seed + i, video, max_steps)
             print(f"episode {i + 1}: return {results[i, 0]:.4g}, length {results[i, 1]:.0f}")
     mean, std = results.mean(axis=0), results.std(axis=0)
     print(f"mean return {mean[0]:.4g} (std {std[0]:.2g}), mean length {mean[1]:.4g}")

@@ -143,7 +143,9 @@ def key_value(text):
         values = json.loads(f"[{words.get(value, value)}]")
     except (ValueError, RecursionError):
         values = [value]
-    return key, values if len(values) > 1 else [*values, value][0]
+    if len(values) == 1:
+        return key, values[0]
+    return key, values or value
 
 
 class Args:
@@ -164,7 +166,7 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def __init__(self, **kwargs):
         formatter = argparse.ArgumentDefaultsHelpFormatter
-        super().__init__(formatter_class=formatter, allow_abbrev=False, **kwargs)
+        super().__init__(**{"formatter_class": formatter, "allow_abbrev": False, **kwargs})
         others = {"real_or_auto": real_or_auto, "key_value": key_value}
         for name, parse in {**NUMBERS, **others}.items():
             self.register("type", name, parse)

@@ -146,3 +146,14 @@ def test_wrong_folders(trained, tmp_path):
     (copy / "config.json").write_text(json.dumps(config))
     assert "Pendulun-v1" in error(copy)
     assert run_files.ABSENT.keys() <= config["args"].keys()
+
+
+def test_noise_of_an_exponent_and_a_long_time_limit(trained, tmp_path):
+    """As the script has them: -1e-1 is a number, and the run's own limit holds."""
+    assert len(shown_returns(play(trained, "--episodes 1 --beta -1e-1"))) == 1
+    copy = tmp_path / "copy"
+    shutil.copytree(trained, copy)
+    config = json.loads((copy / "config.json").read_text())
+    config["args"]["max_episode_steps"] = 10_050
+    (copy / "config.json").write_text(json.dumps(config))
+    assert "length 10050\n" in play(copy, "--episodes 1").stdout
