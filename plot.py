@@ -536,12 +536,16 @@ def animation(betas, n_frames=100, **cars):
     """`untrained_positions` of each beta on the hill, as frames over an episode of 999 steps."""
     goal, runs = 0.45, [untrained_positions(beta, **cars) for beta in betas]
     hill, n_steps = np.linspace(-1.2, 0.6, 200), len(runs[0]) - 1
+
+    def height(x):
+        return 0.45 * np.sin(3 * x) + 0.55
+
     rng = np.random.default_rng(0)
     lift = 0.04 + 0.14 * rng.random(runs[0].shape[1])  # apart from each other, to be seen
     fig, axes = plt.subplots(1, len(betas), figsize=(2.6 * len(betas), 2.1), squeeze=False)
     dots, titles = [], []
     for ax, beta in zip(axes[0], betas, strict=True):
-        ax.fill_between(hill, 0.45 * np.sin(3 * hill) + 0.55, color="0.85", lw=0)
+        ax.fill_between(hill, height(hill), color="0.85", lw=0)
         ax.plot([goal] * 2, [0.99, 1.3], color=INK, lw=1.5)
         ax.fill([goal, goal, goal + 0.12], [1.3, 1.18, 1.24], color="#D55E00", lw=0)
         dots += ax.plot([], [], "o", color=color(beta), ms=3.5, alpha=0.7, mew=0)
@@ -550,17 +554,16 @@ def animation(betas, n_frames=100, **cars):
         ax.spines[:].set_visible(False)
 
     def draw(frame):
-        step = min(round(n_steps * frame / (n_frames - 1)), n_steps)
+        step = round(n_steps * frame / (n_frames - 1))
         for beta, positions, dot, title in zip(betas, runs, dots, titles, strict=True):
             x, there = positions[step], (positions[step] >= goal).sum()
-            dot.set_data(x, 0.45 * np.sin(3 * x) + 0.55 + lift)
+            dot.set_data(x, height(x) + lift)
             name = {0: " (white)", 1: " (pink)", 2: " (red)"}.get(beta, "")
             name = f"$\\beta = {beta:g}${name}, step {step}"
             title.set_text(f"{name}\nat the goal: {there} of {len(x)}")
-        return [*dots, *titles]
 
     pause = [n_frames - 1] * 25
-    return FuncAnimation(fig, draw, [*range(n_frames), *pause], blit=False)
+    return FuncAnimation(fig, draw, [*range(n_frames), *pause])
 
 
 # --- Output ---------------------------------------------------------------------------------------

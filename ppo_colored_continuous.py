@@ -70,7 +70,7 @@ def parse_args(argv=None, **defaults):
     add("--ent-coef", type="real", default=0.0, help="weight of the entropy bonus")
     add("--vf-coef", type="real", default=0.5, help="weight of the value loss")
     add("--max-grad-norm", type="positive", default=0.5, help="bound on the norm of the gradient")
-    add("--bootstrap-timeouts", action=flag, default=True, help="time limits add gamma * V(obs)")
+    add("--bootstrap-timeouts", action=flag, default=True, help="add gamma * V(obs) at time limits")
     add = parser.add_argument_group("running").add_argument
     add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
     add("--threads", type="count", default=run_files.n_cores(), help="of evaluation and EnvPool")
