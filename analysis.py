@@ -716,6 +716,43 @@ def final_return_per_beta(table):
     return pd.DataFrame(rows, columns=[*CELL, "runs", *columns, *differs])
 
 
+def on_published_scale(runs):
+    """Final returns with 0 for the environment's lowest published mean and 1 for its highest.
+
+    Returns the runs with the study's protocol whose cells are published: `final_return` on that
+    scale, and so `paper`, the cell's published mean.
+    """
+    paper = published("final_return_per_beta").rename(columns={"final_return_mean": "paper"})
+    paper = paper[paper.beta != "vanilla"].astype({"beta": float})
+    ends = paper.groupby("environment").paper.agg(["min", "max"])
+    runs = runs[differences(runs) == ""].merge(paper, on=[*CELL, "beta"])
+    need(len(runs), "runs of the study's protocol, n_envs and betas")
+    low, high = (runs.environment.map(ends[end]) for end in ends)
+    both = {column: (runs[column] - low) / (high - low) for column in ("final_return", "paper")}
+    return runs.assign(**both)
+
+
+def average_final_returns(runs):
+    """Sec. A14 averaged over environments: ours beside the paper's, of the same environments.
+
+    runs: of `on_published_scale`. A row per n_envs and beta, of the environments that have all
+    betas with that n_envs.
+    """
+    tables = []
+    for n_envs, group in runs.groupby("n_envs"):
+        try:
+            group = comparable(group, ["beta"], ["environment"])
+        except Unusable:
+            continue
+        table = cells_intervals(group, "final_return", "beta", ["environment"])
+        cells = group.groupby(["beta", "environment"]).paper.first()
+        table = table.assign(paper=cells.groupby("beta").mean()).reset_index()
+        table.insert(0, "n_envs", n_envs)
+        tables.append(table.assign(environments=group.environment.nunique()))
+    need(tables, "an environment with all betas at one n_envs")
+    return pd.concat(tables, ignore_index=True)
+
+
 def robust_statistics(runs):
     """Beyond the paper, because seeds are few (Agarwal et al. 2021), per beta, with intervals:
 

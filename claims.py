@@ -24,6 +24,7 @@ from analysis import (
     final_returns,
     main_grid,
     need,
+    on_published_scale,
     projected_ranks,
     standardize,
     value_text,
@@ -52,6 +53,33 @@ def outside(table):
     line = f"{missed} of {len(known)} published means outside our 95 % intervals, "
     line += f"{chance:.1f} expected by chance ({', '.join(seeds) or 'no cells'})"
     return missed, chance, line
+
+
+def offset(runs):
+    """A line that says how far our final returns are from the published means, on average.
+
+    On the scale of `on_published_scale`, over cells of two seeds and more. The interval is by
+    seeds, of which the paper's 20 are taken to scatter as ours do.
+    """
+    table = on_published_scale(runs[~runs.vanilla])
+    table = table.groupby([*CELL, "beta"]).agg(
+        mean=("final_return", "mean"),
+        variance=("final_return", "var"),
+        seeds=("seed", "nunique"),
+        paper=("paper", "first"),
+    )
+    table = table[table.seeds > 1]
+    if table.empty:
+        return "ours less the published: no cell with two seeds"
+    by_cell = table.variance * (1 / table.seeds + 1 / 20) / len(table) ** 2
+    df = by_cell.sum() ** 2 / max((by_cell**2 / (table.seeds - 1)).sum(), 1e-300)
+    found = {"mean": (table["mean"] - table.paper).mean(), "se": by_cell.sum() ** 0.5, "df": df}
+    low, high = interval(found)
+    scale = "where the paper's lowest is 0 and its highest 1"
+    return (
+        f"ours less the published {found['mean']:z.2f} [{low:z.2f}, {high:z.2f}] on average over "
+        f"{len(table)} cells, {scale}"
+    )
 
 
 def contrast(runs, weights, by, cells=("environment",), of=16):

@@ -468,6 +468,34 @@ def final_return_vs_n_envs(table, betas):
     return fig
 
 
+def beside_published(runs):
+    """Sec. A14: final returns beside the paper's, of each cell and averaged over environments."""
+    runs = analysis.on_published_scale(runs)
+    averages = analysis.average_final_returns(runs)
+    cells = analysis.mean_intervals(runs, "final_return", [*CELL, "beta"])
+    cells["paper"] = runs.groupby([*CELL, "beta"]).paper.first()
+    fig, axes = panels(1 + averages.n_envs.nunique(), BETA, height=2.6)
+    axes[0].axline((0, 0), slope=1, color="0.6", lw=0.9)
+    for beta, group in cells.groupby("beta"):
+        draw_intervals(axes[0], group.paper, group, **look(beta), ls="", ms=4)
+    axes[0].set_title(f"{len(cells)} cells")
+    axes[0].set_ylabel("our final return\n(0 to 1: the paper's lowest to highest)")
+    axes[0].set_xlabel("published final return")
+    for ax, (n_envs, table) in zip(axes[1:], averages.groupby("n_envs"), strict=True):
+        table = table.set_index("beta")
+        ax.plot(table.index, table.paper, color="0.7", ls=":", lw=0.9)
+        for beta, paper in table.paper.items():
+            ax.plot(beta, paper, **{**look(beta), "ms": 8, "mfc": "none"})
+        draw_betas(ax, table)
+        count = int(table.environments.iloc[0])
+        ax.set_title(f"n_envs {n_envs}, {count} environment{'s'[: count > 1]}")
+        ax.set_ylabel("averaged over environments")
+    paper = ("paper", {"ls": ":", "lw": 0.9, "marker": "o", "ms": 8, "mfc": "none"})
+    ours = ("ours, 95 % BCa interval", {"marker": "o"})
+    legend_above(fig, ours, paper, betas=sorted(cells.index.unique("beta")))
+    return fig
+
+
 def robust_performance(table):
     """Beyond the paper: interquartile mean, probability of improvement, of `robust_statistics`."""
     need(table.improvement.notna().any(), "beta 0 and another beta in one environment and n_envs")
@@ -649,6 +677,7 @@ def results(methods, curves, betas=None):
         "gsde_vs_beta": (gsde_vs_beta, with_gsde),
         "coverage": (claims.coverage, methods, curves),
         "final_return_vs_n_envs": (final_return_vs_n_envs, "final_returns", betas),
+        "beside_published": (beside_published, study),
         "robust_performance": (robust_performance, "robust_statistics"),
     }
     lines = colored[colored.beta.isin(betas)]
@@ -716,6 +745,7 @@ def draw_results(args):
     made, report["not made"] = make_all(todo, args.out)
     finals = made.get("final_returns")
     outside = [] if finals is None else [claims.outside(finals)[-1]]
+    outside += [claims.offset(grid)] if "beside_published" in made else []
     report["final returns beside the published"] = outside
     if earlier.startswith("made: "):
         remove(args.out, set(earlier.removeprefix("made: ").split(", ")) - set(made))

@@ -269,6 +269,31 @@ def test_final_return_tables(tmp_path, monkeypatch):
     assert summary.paper_performance_max == 678.91
 
 
+def test_final_returns_on_the_published_scale(tmp_path, monkeypatch):
+    """By hand: pendulum's published means go from 1.1 to 766.9, Mountain Car's from 0 to 96.7."""
+    study(monkeypatch, evaluations=2)
+    for seed, off in ((1, -10), (2, 10)):
+        for beta, end in ((0, 1.1), (0.2, 766.9)):
+            write_run(tmp_path, PENDULUM, beta, 4, seed, [0.0, end + off])
+            write_run(tmp_path, CAR, beta, 4, seed, [0.0, 96.7 * beta])
+    write_run(tmp_path, CAR, 0.2, 32, 1, [0.0, 0.0])
+    write_run(tmp_path, CAR, 0.3, 4, 1, [0.0, 1.0])  # no such beta in the paper
+    write_run(tmp_path / "b", CAR, 1, 4, 1, [0.0, 1.0], gamma=0.9)  # not its protocol
+    runs = pd.concat([select(tmp_path / "test"), select(tmp_path / "b")], ignore_index=True)
+    table = analysis.average_final_returns(analysis.on_published_scale(runs))
+    assert table[["n_envs", "beta", "runs", "environments"]].to_numpy().tolist() == [
+        [4, 0, 4, 2],
+        [4, 0.2, 4, 2],
+        [32, 0.2, 1, 1],
+    ]
+    np.testing.assert_allclose(table["mean"], [0, (1 + 0.2) / 2, 0], atol=1e-9)
+    paper = [(677.5 - 1.1) / 765.8 / 2, (1 + 23.4 / 96.7) / 2, 93.8 / 96.7]
+    np.testing.assert_allclose(table.paper, paper)
+    assert (table.high - table.low)[:2].between(0.005, 0.02).all() and np.isnan(table.low[2])
+    with pytest.raises(analysis.Unusable, match="the study's protocol"):
+        analysis.on_published_scale(select(tmp_path / "b"))
+
+
 def test_published_tables_agree():
     """The mean over 8 betas and 8 n_envs, without vanilla, is the published mean to rounding."""
     cells = analysis.published("final_return_per_beta")
