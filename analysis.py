@@ -437,6 +437,16 @@ def comparable(runs, axes, cells):
     return chosen
 
 
+def two_seeds(runs, axes, cells):
+    """The runs of the cells that have two seeds of each value of `axes`; all, where no cell has.
+
+    A single run has no scatter, and one such cell would leave an average without an interval.
+    """
+    seeds = runs.groupby([*cells, *axes]).seed.transform("nunique")
+    two = seeds.groupby([runs[column] for column in cells]).transform("min") > 1
+    return runs[two] if two.any() else runs
+
+
 def published(name):
     """One of the paper's tables, results/published/NAME.csv."""
     return pd.read_csv(Path(__file__).parent / "results" / "published" / f"{name}.csv")
@@ -735,15 +745,16 @@ def on_published_scale(runs):
 def average_final_returns(runs):
     """Sec. A14 averaged over environments: ours beside the paper's, of the same environments.
 
-    runs: of `on_published_scale`. A row per n_envs and beta, of the environments that have all
-    betas with that n_envs.
+    On the scale of `on_published_scale`. A row per n_envs and beta, of the environments that have
+    all betas with that n_envs, and two seeds of each if any has.
     """
     tables = []
-    for n_envs, group in runs.groupby("n_envs"):
+    for n_envs, group in on_published_scale(runs).groupby("n_envs"):
         try:
             group = comparable(group, ["beta"], ["environment"])
         except Unusable:
             continue
+        group = two_seeds(group, ["beta"], ["environment"])
         table = cells_intervals(group, "final_return", "beta", ["environment"])
         cells = group.groupby(["beta", "environment"]).paper.first()
         table = table.assign(paper=cells.groupby("beta").mean()).reset_index()

@@ -253,11 +253,13 @@ def compare(runs, x, cells, by=None):
     """Performance over x, "beta", "n_envs" or "update_size", with a line per value of column `by`.
 
     Standardized within each environment, then averaged over seeds within `cells`, and over those
-    cells that have all values of x and `by`: environments, and n_envs (Sec. "Does Colored-Noise
-    Affect the Performance") or betas ("How Does the Number of Parallel Collection Environments").
+    cells that have all values of x and `by`, with two seeds of each if any has: environments, and
+    n_envs (Sec. "Does Colored-Noise Affect the Performance") or betas ("How Does the Number of
+    Parallel Collection Environments").
     """
     need(by or runs[x].nunique() > 1, f"at least two values of {x}")
-    chosen = comparable(runs, [x, by] if by else [x], cells)
+    axes = [x, by] if by else [x]
+    chosen = analysis.two_seeds(comparable(runs, axes, cells), axes, cells)
     chosen = chosen.assign(z=analysis.standardize(chosen))
     xlabel = {"beta": BETA_NAMED, "update_size": "update size n_envs \u00b7 n_steps"}.get(x, x)
     fig, [ax] = panels(1, xlabel, STANDARDIZED, height=3)
@@ -470,8 +472,7 @@ def final_return_vs_n_envs(table, betas):
 
 def beside_published(runs):
     """Sec. A14: final returns beside the paper's, of each cell and averaged over environments."""
-    runs = analysis.on_published_scale(runs)
-    averages = analysis.average_final_returns(runs)
+    averages, runs = analysis.average_final_returns(runs), analysis.on_published_scale(runs)
     cells = analysis.mean_intervals(runs, "final_return", [*CELL, "beta"])
     cells["paper"] = runs.groupby([*CELL, "beta"]).paper.first()
     fig, axes = panels(1 + averages.n_envs.nunique(), BETA, height=2.6)
@@ -487,6 +488,8 @@ def beside_published(runs):
         for beta, paper in table.paper.items():
             ax.plot(beta, paper, **{**look(beta), "ms": 8, "mfc": "none"})
         draw_betas(ax, table)
+        if len(table) > 4:  # or their labels would touch
+            ax.set_xticks([-1, 0, 0.5, 1, 2], ["-1", "0", "0.5", "1", "2"])
         count = int(table.environments.iloc[0])
         ax.set_title(f"n_envs {n_envs}, {count} environment{'s'[: count > 1]}")
         ax.set_ylabel("averaged over environments")
@@ -665,6 +668,7 @@ def results(methods, curves, betas=None):
         "final_return_and_performance": (analysis.final_return_and_performance, colored),
         "final_returns": (analysis.final_returns, grid),
         "final_return_per_beta": (analysis.final_return_per_beta, "final_returns"),
+        "average_final_returns": (analysis.average_final_returns, study),
         "robust_statistics": (analysis.robust_statistics, study),
         "performance_vs_beta": (compare, study, "beta", CELL),
         "performance_vs_n_envs": (compare, study, "n_envs", ["environment", "beta"]),

@@ -280,7 +280,7 @@ def test_final_returns_on_the_published_scale(tmp_path, monkeypatch):
     write_run(tmp_path, CAR, 0.3, 4, 1, [0.0, 1.0])  # no such beta in the paper
     write_run(tmp_path / "b", CAR, 1, 4, 1, [0.0, 1.0], gamma=0.9)  # not its protocol
     runs = pd.concat([select(tmp_path / "test"), select(tmp_path / "b")], ignore_index=True)
-    table = analysis.average_final_returns(analysis.on_published_scale(runs))
+    table = analysis.average_final_returns(runs)
     assert table[["n_envs", "beta", "runs", "environments"]].to_numpy().tolist() == [
         [4, 0, 4, 2],
         [4, 0.2, 4, 2],

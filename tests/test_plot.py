@@ -13,7 +13,7 @@ import pytest
 import torch
 from conftest import ROOT, SCRIPT
 from PIL import Image
-from test_analysis import CAR, PENDULUM, PUSH, select, write_run, write_sweep
+from test_analysis import CAR, PENDULUM, PUSH, select, study, write_run, write_sweep
 from test_analysis import run_file as run_file  # the fixture `run`
 from test_claims import made_up
 
@@ -244,7 +244,8 @@ def test_every_figure_and_table_of_a_real_sweep(monkeypatch, tmp_path, sweep):
     assert left_out == []
     methods = {"ppo": runs} | other_methods(runs)
     todo = plot.results(methods, curves)
-    del todo["beside_published"]  # only of runs with the study's protocol: a test of its own
+    for name in ("average_final_returns", "beside_published"):
+        del todo[name]  # only of runs with the study's protocol: they have tests of their own
     assert check_figures(monkeypatch, tmp_path, todo, FIGURES | TABLES) == FIGURES
     for name in TABLES:
         table = pd.read_csv(tmp_path / f"{name}.csv")
@@ -259,10 +260,8 @@ def test_every_figure_and_table_of_a_real_sweep(monkeypatch, tmp_path, sweep):
     (tmp_path / "few").mkdir()
     made, not_made = plot.make_all(plot.results({"ppo": few}, curves), tmp_path / "few")
     assert {"final_returns", "learning_curves_n_envs_2", "final_return_vs_n_envs"} <= set(made)
-    assert [line.split(": needs ")[0] for line in not_made][:2] == [
-        "performance_vs_beta",
-        "performance_vs_n_envs",
-    ]
+    missing = {line.split(": needs ")[0] for line in not_made}
+    assert {"performance_vs_beta", "performance_vs_n_envs", "average_final_returns"} <= missing
 
 
 @pytest.mark.filterwarnings("error")
@@ -278,23 +277,22 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
     assert len({plot.look(beta)["marker"] for beta in analysis.STUDY_BETAS}) == 8
 
 
-@pytest.mark.parametrize(
-    ("readme", "data"),
-    [("results/README.md", "reproduction.csv"), ("results/README.md", "bootstrapped_timeouts.csv")],
-)
-def test_the_readmes_show_the_tables_of_the_data(tmp_path, readme, data):
+@pytest.mark.parametrize("data", ["reproduction.csv", "study.csv", "bootstrapped_timeouts.csv"])
+def test_the_evidence_shows_the_tables_of_the_data(tmp_path, data):
     runs, _ = analysis.select(analysis.load([ROOT / "results" / data])[0])
     analysis.save_table(
         analysis.final_return_per_beta(analysis.final_returns(runs)), tmp_path, "table"
     )
-    assert (tmp_path / "table.md").read_text() + "\n" in (ROOT / readme).read_text()
+    text = (ROOT / "results" / "README.md").read_text()
+    assert (tmp_path / "table.md").read_text() + "\n" in text
 
 
 @pytest.mark.filterwarnings("error")
-def test_labels_of_the_whole_grid_do_not_touch(tmp_path):
+def test_labels_of_the_whole_grid_do_not_touch(tmp_path, monkeypatch):
     """Eight betas, eight n_envs, and n_steps: the axes as full as the study fills them."""
     n_envs = [1, 2, 4, 8, 16, 32, 64, 128]
     write_sweep(tmp_path, dict.fromkeys(analysis.STUDY_BETAS, 1), n_envs, seeds=2)
+    study(monkeypatch, evaluations=4)
     for n, n_steps in ((2, 4096), (8, 1024)):
         write_run(tmp_path, PENDULUM, 0.5, n, 1, [1.0] * 4, n_steps=n_steps, exp_name=f"n{n}")
     runs, curves = analysis.load([tmp_path])
@@ -302,6 +300,7 @@ def test_labels_of_the_whole_grid_do_not_touch(tmp_path):
     todo = plot.results({"ppo": runs}, curves)
     names = ["performance_vs_beta", "performance_vs_n_envs", "n_envs_vs_n_steps"]
     names += ["n_envs_beta_grids", "final_return_vs_n_envs", "robust_performance"]
+    names += ["beside_published"]
     made = {"final_returns": analysis.final_returns(runs[runs.n_steps == 2048])}
     made["robust_statistics"] = analysis.robust_statistics(runs[runs.n_steps == 2048])
     for name in names:
@@ -355,7 +354,10 @@ def test_averages_say_what_they_are_made_of(tmp_path):
     fig = plot.compare(runs, "beta", ["environment", "n_envs"])
     assert fig.axes[0].get_title() == "2 environments, n_envs 4, 32 (3 cells), 30 runs"
     fewer = runs[(runs.env_id != CAR) | (runs.seed == 1)]
-    one = plot.compare(fewer, "beta", ["environment", "n_envs"])
+    two = plot.compare(fewer, "beta", ["environment", "n_envs"])  # without the cell of one seed
+    assert two.axes[0].get_title() == title.replace("10 runs", "2 runs")
+    assert two.axes[0].collections[0].get_segments()[0][:, 1].std() > 0  # an interval
+    one = plot.compare(runs[runs.seed == 1], "beta", ["environment", "n_envs"])
     assert one.axes[0].get_title().endswith("\n(no interval where a cell has one run)")
     means = fig.axes[0].lines[0].get_ydata()
     z = runs.assign(z=analysis.standardize(runs)).groupby(["beta", "environment", "n_envs"]).z
