@@ -72,15 +72,17 @@ def offset(runs):
     table = table[table.seeds > 1]
     if table.empty:
         return "ours less the published: no cell with two seeds"
+    mean = (table["mean"] - table.paper).mean()
     by_cell = table.variance * (1 / table.seeds + 1 / 20) / len(table) ** 2
-    df = by_cell.sum() ** 2 / max((by_cell**2 / (table.seeds - 1)).sum(), 1e-300)
-    found = {"mean": (table["mean"] - table.paper).mean(), "se": by_cell.sum() ** 0.5, "df": df}
-    low, high = interval(found)
-    scale = "where the paper's lowest is 0 and its highest 1"
-    return (
-        f"ours less the published {found['mean']:z.2f} [{low:z.2f}, {high:z.2f}] on average over "
-        f"{len(table)} cells, {scale}"
-    )
+    low, high = interval({"mean": mean} | summed(by_cell, table.seeds - 1))
+    line = f"ours less the published {mean:z.2f} [{low:z.2f}, {high:z.2f}] on average over "
+    return line + f"{len(table)} cells, where the paper's lowest is 0 and its highest 1"
+
+
+def summed(variances, df):
+    """Standard error and degrees of freedom (Satterthwaite) of a sum of independent estimates."""
+    total, squares = variances.sum(), (variances**2 / df).sum()
+    return {"se": total**0.5, "df": total**2 / squares if squares != 0 else np.inf}
 
 
 def contrast(runs, weights, by, cells=("environment",), of=16):
@@ -116,15 +118,14 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
     f = min(n / of, 1)
     within = f * (variance * weight**2 / seeds).div((n_cells * n) ** 2, axis=0).to_numpy()
     between = (1 - f) * by_environment.var() / n if f < 1 else 0.0
-    total, squares = within.sum() + between, (within**2 / (seeds - 1).clip(lower=1)).to_numpy()
-    squares = squares.sum() + (between**2 / (n - 1) if between else 0)
+    variances = np.append(within, between)
+    each_df = np.append((seeds - 1).clip(lower=1), max(n - 1, 1))
     enough, made_of = n >= of / 2, f"{n} environment{'s'[: n > 1]}"
     if len(cells) > 1:
         values = mean.groupby(level=1).size()
         enough &= (values >= of / 2).sum() >= 3
         made_of += f", {cells[1]} {', '.join(f'{value:g}' for value in values.index)}"
-    df = total**2 / squares if squares != 0 else np.inf
-    found = {"mean": by_environment.mean(), "se": total**0.5, "df": df}
+    found = {"mean": by_environment.mean()} | summed(variances, each_df)
     return found | {"environments": n, "enough": bool(enough), "made_of": made_of}
 
 

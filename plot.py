@@ -470,9 +470,12 @@ def final_return_vs_n_envs(table, betas):
     return fig
 
 
-def beside_published(runs):
-    """Sec. A14: final returns beside the paper's, of each cell and averaged over environments."""
-    averages, runs = analysis.average_final_returns(runs), analysis.on_published_scale(runs)
+def beside_published(averages, runs):
+    """Sec. A14: final returns beside the paper's, of each cell and averaged over environments.
+
+    averages: of `average_final_returns`.
+    """
+    runs = analysis.on_published_scale(runs)
     cells = analysis.mean_intervals(runs, "final_return", [*CELL, "beta"])
     cells["paper"] = runs.groupby([*CELL, "beta"]).paper.first()
     fig, axes = panels(1 + averages.n_envs.nunique(), BETA, height=2.6)
@@ -681,7 +684,7 @@ def results(methods, curves, betas=None):
         "gsde_vs_beta": (gsde_vs_beta, with_gsde),
         "coverage": (claims.coverage, methods, curves),
         "final_return_vs_n_envs": (final_return_vs_n_envs, "final_returns", betas),
-        "beside_published": (beside_published, study),
+        "beside_published": (beside_published, "average_final_returns", study),
         "robust_performance": (robust_performance, "robust_statistics"),
     }
     lines = colored[colored.beta.isin(betas)]
