@@ -426,25 +426,19 @@ def missing(runs):
 def comparable(runs, axes, cells):
     """The runs of the cells that have all values of `axes` which occur in these runs.
 
-    An average over cells compares values of an axis only where each is of the same cells. axes,
-    cells: lists of columns. Raises Unusable where no cell has all.
+    An average over cells compares values of an axis only where each is of the same cells. If cells
+    are there with two seeds of each value, only those: a single run has no scatter, and one such
+    cell would leave an average without an interval. axes, cells: lists of columns. Raises Unusable
+    where no cell has all.
     """
     values = runs.groupby(axes).ngroup()
     there = values.groupby([runs[column] for column in cells]).transform("nunique")
     chosen, n = runs[there == values.nunique()], values.nunique()
     what = f"one {' and '.join(cells)} with all {n} values of {' and '.join(axes)}"
     need(len(chosen), f"{what}: filter by --env, --beta, --n-envs")
-    return chosen
-
-
-def two_seeds(runs, axes, cells):
-    """The runs of the cells that have two seeds of each value of `axes`; all, where no cell has.
-
-    A single run has no scatter, and one such cell would leave an average without an interval.
-    """
-    seeds = runs.groupby([*cells, *axes]).seed.transform("nunique")
-    two = seeds.groupby([runs[column] for column in cells]).transform("min") > 1
-    return runs[two] if two.any() else runs
+    seeds = chosen.groupby([*cells, *axes]).seed.transform("nunique")
+    two = seeds.groupby([chosen[column] for column in cells]).transform("min") > 1
+    return chosen[two] if two.any() else chosen
 
 
 def published(name):
@@ -527,8 +521,10 @@ def cells_interval(samples):
     """Mean over cells of the mean over each cell's runs, with a 95 % BCa bootstrap interval.
 
     The seeds are drawn within cells: environments and n_envs are the study's choice, not chance.
-    Each cell weighs the same, however many seeds it has. samples: arrays (runs,), one per cell.
-    Returns mean, low, high; NaN where a cell has one run, whose scatter is not known.
+    Each cell weighs the same, however many seeds it has. Drawing n of n seeds makes the variance of
+    their mean too small, by (n - 1) / n; they are spread by the root of its inverse (as Rao and Wu
+    1988), since cells of two or three seeds would have half of it. samples: arrays (runs,), one per
+    cell. Returns mean, low, high; NaN where a cell has one run, whose scatter is not known.
     """
 
     def mean(*cells, axis=-1):
@@ -540,6 +536,7 @@ def cells_interval(samples):
         return center, np.nan, np.nan
     if not any(np.ptp(cell) > 0 for cell in samples):
         return center, center, center
+    samples = [x.mean() + (x - x.mean()) * (len(x) / (len(x) - 1)) ** 0.5 for x in samples]
     how = {"n_resamples": 9999, "batch": 500, "rng": np.random.default_rng(0), "vectorized": True}
     return center, *stats.bootstrap(samples, mean, method="BCa", **how).confidence_interval
 
@@ -754,7 +751,6 @@ def average_final_returns(runs):
             group = comparable(group, ["beta"], ["environment"])
         except Unusable:
             continue
-        group = two_seeds(group, ["beta"], ["environment"])
         table = cells_intervals(group, "final_return", "beta", ["environment"])
         cells = group.groupby(["beta", "environment"]).paper.first()
         table = table.assign(paper=cells.groupby("beta").mean()).reset_index()

@@ -259,7 +259,7 @@ def compare(runs, x, cells, by=None):
     """
     need(by or runs[x].nunique() > 1, f"at least two values of {x}")
     axes = [x, by] if by else [x]
-    chosen = analysis.two_seeds(comparable(runs, axes, cells), axes, cells)
+    chosen = comparable(runs, axes, cells)
     chosen = chosen.assign(z=analysis.standardize(chosen))
     xlabel = {"beta": BETA_NAMED, "update_size": "update size n_envs \u00b7 n_steps"}.get(x, x)
     fig, [ax] = panels(1, xlabel, STANDARDIZED, height=3)
