@@ -503,6 +503,43 @@ def test_walls_stop_the_point(env_id):
     assert stopped > 100
 
 
+# Steps of the original, mujoco-maze's last commit on MuJoCo 2.3.7, with random actions in 4 Rooms:
+# (x, y, heading and their velocities, action, the same after it). Three without a contact, three
+# whose arrow reaches into a wall.
+STEPS_OF_THE_ORIGINAL = [
+    ((24.544124704, -7.648206685, -2.404735152, -2.911415813, 0.034421268, -0.113542444),
+     (-1, -0.25), (25.369704, -7.179667, -2.657006, -2.911426, 0.034416, -0.113542)),
+    ((1.143611696, -5.723967427, 2.153337498, 0.168680069, 1.649482437, 0.297422143),
+     (-1, 0.25), (1.886629, -6.363976, 2.409286, 0.168624, 1.649533, 0.297422)),
+    ((5.004113479, -5.106884473, -1.694575674, -1.819045921, -2.346958283, -0.378096645),
+     (1, -0.16259516), (4.685256, -6.113099, -1.864733, -1.819081, -2.347075, -0.378097)),
+    ((5.373260648, 1.135419284, 0.853469721, 1.630943112, -3.420149248, 3.465677001),
+     (0.829927104, -0.25), (6.086558, 1.535258, 0.663334, 1.439031, -3.628705, 2.699407)),
+    ((-1.149734094, -18.15080019, -0.459999455, 1.60360509, -2.135812717, -3.562964414),
+     (-0.7463501, -0.203841296), (-1.529404, -17.739098, -0.752373, 2.959801, -1.463242, -4.935389)),
+    ((9.325972641, -3.071988897, 0.980455842, 1.377631812, -1.317789953, -4.424649255),
+     (0.627708622, 0.25), (9.561634, -2.504346, 1.172567, 1.20968, -1.053599, -0.852637)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("before, action, after", STEPS_OF_THE_ORIGINAL)
+def test_point_moves_as_in_the_original(before, action, after):
+    env = make("Point4Rooms-v1")
+    env.reset(seed=0)
+    env.data.qpos[:], env.data.qvel[:], env.data.qacc_warmstart[:] = before[:3], before[3:], 0
+    np.testing.assert_allclose(env.step(action)[0][:6], after, atol=2e-5)
+
+
+def test_point_slides_without_friction():
+    """At any heading: rounding must not make a contact of its sphere and the floor."""
+    env = make("Point4Rooms-v1")
+    env.reset(seed=0)
+    for heading in np.linspace(-3, 3, 200):
+        env.data.qpos[:], env.data.qvel[:] = (0, 0, heading), (0.5, 0.5, 0)
+        env.step([0, 0])
+        np.testing.assert_allclose(env.data.qvel, [0.5, 0.5, 0], atol=1e-3)
+
+
 # --- Blocks
 
 
