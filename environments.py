@@ -185,9 +185,12 @@ def make_env(env_id, max_episode_steps=None, rescale_actions=False, env_kwargs=N
     try:
         if name.startswith("dm_control/"):
             import shimmy  # noqa: F401  registers the dm_control ids
-        if max_episode_steps is not None and is_from_dm_control_suite(name):
-            kwargs["task_kwargs"] = {"time_limit": math.inf}  # s, its limit inside Gymnasium's
+        if name and name not in gym.registry and not re.search(r"-v\d+$", name):
+            raise gym.error.UnregisteredEnv  # Gymnasium would guess the version, EnvPool would not
         kwargs |= {"disable_env_checker": True, **(env_kwargs or {})}
+        if max_episode_steps is not None and is_from_dm_control_suite(name):
+            no_limit = {"time_limit": math.inf}  # s, its limit inside Gymnasium's
+            kwargs["task_kwargs"] = no_limit | kwargs.get("task_kwargs", {})
         with contextlib.nullcontext() if "render_mode" in kwargs else tiny_textures():
             env = gym.make(name, max_episode_steps, **kwargs)
     except gym.error.Error as error:
@@ -203,7 +206,8 @@ def make_env(env_id, max_episode_steps=None, rescale_actions=False, env_kwargs=N
             f"{env_id} needs a package that is not installed: {error}"
         ) from error
     except Exception as error:
-        if not env_kwargs or (module and "unexpected keyword argument" not in str(error)):
+        told = re.search("unexpected keyword argument|multiple values for", str(error))
+        if not env_kwargs or (module and not told):
             raise
         raise gym.error.Error(f"{env_id} cannot be made with --env-kwargs: {error}") from error
     actions, observations = env.action_space, env.observation_space

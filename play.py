@@ -47,6 +47,8 @@ def parse_args(argv=None):
     if args.video and args.video.suffix != ".mp4":
         parser.error(f"--video {args.video} has to end in .mp4")
     args.episodes = args.episodes or (1 if args.video else 10)
+    if args.seed + args.episodes > 2**32:  # dm_control's are 32 bits
+        parser.error(f"--seed {args.seed} is too large")
     return args
 
 
@@ -90,9 +92,10 @@ def make_env(run_args, state, args):
     return env
 
 
-def make_policy(acting, env, args, gsde=False):
+def make_policy(acting, env, args, run_args):
     """Returns policy(obs (1, obs_dim)) -> actions (1, action_dim): the mean, or with noise."""
     action_dim = env.action_space.shape[0]
+    gsde = run_args.method == "gsde"
     make_agent = baselines.GSDEAgent if gsde else ppo.Agent
     agent = make_agent(env.observation_space.shape[0], action_dim).requires_grad_(False)
     agent.load_state_dict(acting["agent"])
@@ -103,7 +106,8 @@ def make_policy(acting, env, args, gsde=False):
         fail("--beta: a gSDE policy has noise of its own, without a color", 2)
     if len(args.beta) not in (1, action_dim):
         fail(f"--beta has {len(args.beta)} values, the run {action_dim} action dimensions", 2)
-    noise, std = ColoredNoiseProcess(args.beta, 1, action_dim, seed=args.seed), agent.log_std.exp()
+    noise = ColoredNoiseProcess(args.beta, 1, action_dim, run_args.noise_seq_len, args.seed)
+    std = agent.log_std.exp()
     return lambda obs: policy(obs) + (std * noise.sample()).numpy()
 
 
@@ -124,7 +128,7 @@ def main(args):
     with run_files.one_line_for(gym.error.Error):
         env = make_env(run_args, acting["normalization"], args)
     with run_files.one_line_for(RuntimeError, because=f"the policy in {args.run} does not fit: "):
-        policy = make_policy(acting, env, args, gsde=run_args.method == "gsde")
+        policy = make_policy(acting, env, args, run_args)
     noise = f"noise of beta {' '.join(f'{b:g}' for b in args.beta)}" if args.beta else "no noise"
     print(f"{run_args.env_id}, the policy after {acting['step']:,} steps, {noise}")
     results, max_steps = np.zeros((args.episodes, 2)), run_args.max_episode_steps or 10_000

@@ -710,7 +710,8 @@ def parse_args():
     for each in (parser, noise, results, sheet, cars):
         each.error = lambda message: fail(f"{message} (--help lists the arguments)", code=2)
     analysis.add_runs(results)
-    results.add_argument("--method", default="ppo", help="which method's runs (default: ppo)")
+    methods = {"default": "ppo", "choices": analysis.METHODS}
+    results.add_argument("--method", **methods, help="which method's runs (default: ppo)")
     default = {"default": STUDY_BETAS, "help": "default: those of the study"}
     noise.add_argument("--beta", nargs="+", type=analysis.finite, **default)
     for command in (noise, results):

@@ -114,7 +114,7 @@ def layer_init(layer, gain=2**0.5):
 class Agent(nn.Module):
     """Separate actor and critic of 64-64 tanh units, and a log std that is the same in all states.
 
-    Any layers will do, and any parameters: what acts and what learns is made from this module.
+    Any layers and parameters will do. actor_mean and log_std alone act; forward() is for learning.
     """
 
     def __init__(self, obs_dim, action_dim):
@@ -237,8 +237,8 @@ def ppo_loss(params, minibatch, agent, args):
     values (batch,). Returns the loss and a dict of what is to be logged.
     """
     obs, actions, old_logprobs, advantages, returns, _ = minibatch
-    named = agent.unflatten(params)
-    logprobs, entropy, values = torch.func.functional_call(agent, named, (obs, actions))
+    call, named = torch.func.functional_call, agent.unflatten(params)
+    logprobs, entropy, values = call(agent, named, (obs, actions), tie_weights=False)
     if args.normalize_advantage and len(advantages) > 1:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     log_ratio = logprobs - old_logprobs
@@ -343,12 +343,12 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     if len(args.beta) not in (1, action_dim):
         fail(f"--beta has {len(args.beta)} values, {args.env_id} {action_dim} action dimensions", 2)
     run = RunFolder(args)
-    if run.summary:
+    if run.summary is not None:
         return print(f"complete: final return {run.summary['final_return']:.4g} in {run.path} "
                      "(--overwrite runs it again)")  # fmt: skip
     init_seed, noise_seed = make_seeds(2, args.seed, 0)
     torch.manual_seed(init_seed)
-    agent = make_agent(obs_dim, action_dim).to(args.device).requires_grad_(False)
+    agent = run_files.learnable(make_agent(obs_dim, action_dim)).to(args.device)
     with run_files.one_line_for(MemoryError, RuntimeError, because="not enough memory: "):
         size, shape = (args.n_envs, action_dim, args.noise_seq_len), (args.n_steps, args.n_envs)
         noise = ColoredNoiseProcess(args.beta, *size, noise_seed)
@@ -365,7 +365,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
         with run.one_line_if_it_does_not_fit():  # after an edit, say
             agent.load_state_dict(run.checkpoint["agent"])
             normalization.load_state_dict(run.checkpoint.get("normalization", {}))
-            optimizer = tuple(x.to(args.device) for x in run.checkpoint["optimizer"])
+            optimizer = run_files.refilled(optimizer, run.checkpoint["optimizer"])
             noise.load_state_dict(run.checkpoint["noise"])
             torch.set_rng_state(run.checkpoint["torch_rng"])
         global_step, next_eval = run.checkpoint["global_step"], run.checkpoint["next_eval"]

@@ -195,8 +195,8 @@ def recorded(args, name, default):
 def check_device(device):
     """Ends the program where tensors on this torch device cannot be made and read."""
     try:
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError):
+        torch.zeros(1, dtype=torch.float64, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError):
         fail(f"--device {device} is not available here", code=2)
 
 
@@ -210,7 +210,11 @@ def make_seeds(n, *key):
 
 def _compile_cache():
     """The folder where torch.compile keeps what it has compiled, by its own rule."""
-    default = f"{tempfile.gettempdir()}/torchinductor_{getpass.getuser()}"
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # in a container this user may have no name
+        user = os.getuid()
+    default = f"{tempfile.gettempdir()}/torchinductor_{user}"
     return os.environ.get("TORCHINDUCTOR_CACHE_DIR", default)
 
 
@@ -246,13 +250,46 @@ def one_line_for(*errors, because=""):
         fail(f"{because}{error}", code=2)
 
 
+def learnable(agent):
+    """The module `agent`, ready to be learned as one flat vector, without autograd.
+
+    Ends the program for what that would get wrong in silence: a parameter that is to stay as it is,
+    and one that belongs to two modules. A module in two places is one module.
+    """
+    names = {}
+    for prefix, module in agent.named_modules():
+        for name, parameter in module.named_parameters(prefix, recurse=False):
+            if not parameter.requires_grad:
+                fail(f"{name} has requires_grad=False and would be learned all the same: "
+                     "register_buffer keeps a value as it is")  # fmt: skip
+            if id(parameter) in names:
+                fail(f"{name} and {names[id(parameter)]} are one parameter in two modules: use one "
+                     "module in both places")  # fmt: skip
+            names[id(parameter)] = name
+    return agent.requires_grad_(False)
+
+
+def refilled(fresh, saved):
+    """The tensors `saved`, on the devices of the fresh ones. ValueError where shapes differ."""
+    if [x.shape for x in fresh] != [x.shape for x in saved]:
+        raise ValueError("the optimizer's tensors have other shapes")
+    return tuple(y.to(x.device) for x, y in zip(fresh, saved, strict=True))
+
+
 def numpy_policy(actor):
     """The module `actor` as a function from numpy to numpy: obs (n, obs_dim) -> (n, action_dim).
 
     The networks are so small that calling torch takes longer than computing: 31 us for 4 rows,
-    numpy 6. Layers that are known here are computed in numpy; with any other the module is called.
-    The weights are copied: make it anew when the module has learned.
+    numpy 6. Layers that are known here are computed in numpy; with any other the module is called,
+    in eval mode. The weights are copied: make it anew when the module has learned.
     """
+
+    def called(obs):
+        training, device = actor.training, next(actor.parameters()).device
+        actions = actor.eval()(torch.as_tensor(obs, device=device)).cpu().numpy()
+        actor.train(training)
+        return actions
+
     activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0), nn.Identity: lambda x: x}
     layers = actor if type(actor) is nn.Sequential else [actor]
     functions = []
@@ -264,8 +301,7 @@ def numpy_policy(actor):
         elif type(layer) in activations and not hooks:
             functions.append(activations[type(layer)])
         else:
-            device = next(actor.parameters()).device
-            return lambda obs: actor(torch.as_tensor(obs, device=device)).cpu().numpy()
+            return called
 
     def policy(obs):
         for function in functions:
@@ -348,11 +384,17 @@ class RunFolder:
                  "or --exp-name", code=3)  # fmt: skip
         except OSError as error:
             fail(f"cannot write to {self.path} ({error.strerror}): choose another --runs-dir")
-        if args["overwrite"] or not (self.path / "config.json").exists():
+        if args["overwrite"]:
+            return
+        if not (self.path / "config.json").exists():
+            for name in ("summary.json", "checkpoint.pt", "evaluations.csv"):
+                if (self.path / name).exists():
+                    fail(f"{self.path} has {name} but no config.json: restore it, or start again "
+                         "with --overwrite")  # fmt: skip
             return
         longer = self._check_same_run()
         if (self.path / "summary.json").exists() and not longer:
-            self.summary = self._read_json("summary.json")
+            self.summary = self._read_json("summary.json", "final_return", float)
         elif not args["resume"]:
             fail(f"{self.path} holds an unfinished run: add --resume to continue it, or "
                  "--overwrite to start again")  # fmt: skip
@@ -370,7 +412,7 @@ class RunFolder:
             if self.checkpoint:
                 self._earlier_seconds = self.checkpoint["wall_seconds"]
                 (self.path / "summary.json").unlink(missing_ok=True)  # of a run trained longer
-                config = self._read_json("config.json")
+                config = self._read_json("config.json", "args", dict)
                 config["args"]["total_timesteps"] = self._args["total_timesteps"]
                 self._write_json("config.json", config)
                 self._cut_back(self.checkpoint["file_sizes"])
@@ -464,6 +506,8 @@ class RunFolder:
     def finish(self, steps):
         """Writes summary.json, which makes the run complete, and says what is in it."""
         rows = (self.path / "evaluations.csv").read_text().splitlines()[1:]
+        if len(rows) != self._args["total_timesteps"] // self._args["eval_freq"]:
+            fail(f"{self.path / 'evaluations.csv'} was changed during the run: {len(rows)} rows")
         returns = [float(row.split(",")[1]) for row in rows]
         summary = {
             "performance": sum(returns) / len(returns),
@@ -514,7 +558,7 @@ class RunFolder:
 
         Returns whether this is the same run, but longer.
         """
-        old = ABSENT | self._read_json("config.json").get("args", {})
+        old = ABSENT | self._read_json("config.json", "args", dict)["args"]
         args = json.loads(json.dumps(self._args))
         total, old_total = args["total_timesteps"], old.get("total_timesteps")
         could_be = isinstance(old_total, int) and total > old_total
@@ -539,14 +583,19 @@ class RunFolder:
         path = self.path / "checkpoint.pt"
         try:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-            size = checkpoint["file_sizes"]["evaluations.csv"]
+            size, _ = checkpoint["file_sizes"]["evaluations.csv"], checkpoint["wall_seconds"]
             if "agent" not in checkpoint:
                 raise ValueError("it is of an earlier version of this code")
-            if (self.path / "evaluations.csv").stat().st_size < size:
-                raise ValueError("evaluations.csv is shorter than it was")
+            rows = (self.path / "evaluations.csv").read_bytes()[:size].decode().split("\n")
+            steps = range(self._args["eval_freq"], checkpoint["next_eval"], self._args["eval_freq"])
+            if [row.split(",")[0] for row in rows] != ["step", *map(str, steps), ""]:
+                raise ValueError("evaluations.csv is not what it was")
         except Exception as error:  # torch.load raises nearly anything on a damaged file
             reason = str(error).split(". ")[0][:100]
             fail(f"{path} is damaged ({reason}): restore it, or start again with --overwrite")
+        if checkpoint["next_eval"] < checkpoint["global_step"]:  # the last update went beyond it
+            fail(f"the run in {self.path} cannot be trained longer: the policy to evaluate at step "
+                 f"{checkpoint['next_eval']} is gone")  # fmt: skip
         return checkpoint
 
     @contextlib.contextmanager
@@ -597,10 +646,12 @@ class RunFolder:
     def _write_json(self, name, value):
         self._write(name, (json.dumps(value, indent=2) + "\n").encode())
 
-    def _read_json(self, name):
+    def _read_json(self, name, key, kind):
+        """The dict in the file, with a value of this kind behind the key."""
         try:
-            return json.loads((self.path / name).read_text())
-        except (ValueError, RecursionError):
+            value = json.loads((self.path / name).read_text())
+            return value | {key: kind(value[key])}
+        except (ValueError, RecursionError, TypeError, KeyError):
             fail(f"{self.path / name} is damaged: restore it, or start again with --overwrite")
 
 

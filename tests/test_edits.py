@@ -113,6 +113,47 @@ def test_layers(tmp_path, original, edits, in_numpy):
     assert final_return != pytest.approx(original[1], rel=1e-3)
 
 
+LOG_STD = "self.log_std = nn.Parameter(torch.zeros(action_dim))"
+CRITIC = "self.critic = mlp(1, gain=1.0)"
+
+
+def test_a_fixed_std(tmp_path, capsys):
+    """As a buffer it stays as it is; a parameter that is not to be learned is refused."""
+    frozen = LOG_STD[:-1] + ", requires_grad=False)"
+    with pytest.raises(SystemExit):
+        run(edit(tmp_path, (LOG_STD, frozen)), tmp_path)
+    message = capsys.readouterr().err
+    assert "log_std has requires_grad=False" in message and message.count("\n") == 1
+    buffer = 'self.register_buffer("log_std", torch.zeros(action_dim))'
+    agent, _, scalars = run(edit(tmp_path, (LOG_STD, buffer)), tmp_path)
+    assert scalars["rollout/std"] == [1.0] * 4 and len(parameters(agent)) == 8962
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_a_trunk_that_actor_and_critic_share(tmp_path, original, flags):
+    head = "layer_init(nn.Linear(64, 1), 1.0)"
+    shared = f"self.critic = nn.Sequential(*self.actor_mean[:-1], {head})"
+    agent, final_return, scalars = run(edit(tmp_path, (CRITIC, shared)), tmp_path, flags)
+    assert agent.critic[0] is agent.actor_mean[0] and final_return != original[1]
+    trunk = agent.actor_mean[0].weight
+    fresh = torch.linalg.svdvals(trunk)  # it begins orthogonal, times the root of two
+    assert (fresh - 2**0.5).abs().max() > 1e-3 and np.isfinite(scalars["losses/value_loss"]).all()
+
+
+def test_one_parameter_in_two_modules_is_refused(tmp_path, capsys):
+    tied = f"{CRITIC}\n        self.critic[0].weight = self.actor_mean[0].weight"
+    with pytest.raises(SystemExit):
+        run(edit(tmp_path, (CRITIC, tied)), tmp_path)
+    assert "are one parameter in two modules" in capsys.readouterr().err
+
+
+def test_dropout_is_off_in_the_policy():
+    actor = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.Dropout(), torch.nn.Linear(64, 1))
+    policy = run_files.numpy_policy(actor.requires_grad_(False))
+    obs = np.ones((1, 3), np.float32)
+    assert policy(obs) == policy(obs) and actor.training
+
+
 def test_an_edit_does_not_fit_an_earlier_checkpoint(tmp_path, capsys):
     """And --resume loses nothing of the run that is there."""
     run(edit(tmp_path), tmp_path)

@@ -245,6 +245,20 @@ def test_a_longer_time_limit_replaces_the_one_inside_dm_control():
     assert ends == [False] * 1002 + [True]
 
 
+def test_a_longer_time_limit_and_other_arguments_of_the_task():
+    name, given = "dm_control/pendulum-swingup-v0", {"task_kwargs": {"random": 1}}
+    env = make_env(name, max_episode_steps=1003, env_kwargs=given)
+    env.reset(seed=1)
+    ends = [any(env.step(np.zeros(1, np.float32))[2:4]) for _ in range(1003)]
+    assert ends == [False] * 1002 + [True]
+
+
+def test_a_name_without_its_version_is_refused():
+    for name in ("MountainCarContinuous", "dm_control/pendulum-swingup"):
+        with pytest.raises(gym.error.UnregisteredEnv, match=f"did you mean {name}-v0"):
+            make_env(name)
+
+
 def through_pickle(env):
     return pickle.loads(pickle.dumps(env))
 

@@ -22,7 +22,9 @@ import ppo_colored_continuous as ppo
 import run_files
 from colored_noise import ColoredNoiseProcess
 
-FLAGS = "--env-id Pendulum-v1 --normalize-obs --normalize-rewards --rescale-actions "
+FLAGS = (
+    "--noise-seq-len 40 --env-id Pendulum-v1 --normalize-obs --normalize-rewards --rescale-actions "
+)
 FLAGS += "--env-kwargs g=5 --max-episode-steps 30 --learning-rate 1e-2"
 
 
@@ -53,7 +55,7 @@ def by_hand(folder, file="checkpoint.pt", beta=None, seed=1):
     mean, var = (np.array(statistics[name]) for name in ("mean", "var"))
     agent = ppo.Agent(3, 1).requires_grad_(False)
     agent.load_state_dict(saved["agent"])
-    noise = beta and ColoredNoiseProcess([beta], 1, 1, seed=seed)
+    noise = beta and ColoredNoiseProcess([beta], 1, 1, seq_len=40, seed=seed)
     env, total = gym.make("Pendulum-v1", max_episode_steps=30, g=5), 0
     obs, _ = env.reset(seed=seed)
     for _ in range(30):

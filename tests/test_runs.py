@@ -709,6 +709,61 @@ def test_a_finished_run_can_be_trained_longer(train, tiny, tmp_path):
     assert len(read_evaluations(folder)) == 16
 
 
+def test_a_run_that_learned_beyond_its_end_cannot_be_trained_longer(train, tiny, tmp_path):
+    """The policy to evaluate at 4000 is that of 3584, and the run has gone on to 4096."""
+    uneven = tiny.replace("512", "500").replace("4096", "3600")
+    assert train(uneven).returncode == 0
+    files = {path: path.read_bytes() for path in only_run(tmp_path).iterdir()}
+    longer = uneven.replace("3600", "8192") + " --resume"
+    assert_one_line_error(train(longer), "cannot be trained longer", "step 4000", code=1)
+    assert {path: path.read_bytes() for path in only_run(tmp_path).iterdir()} == files
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("config.json", None),
+        ("config.json", "[]"),
+        ("config.json", '{"args": []}'),
+        ("summary.json", "{}"),
+        ("summary.json", "null"),
+        ("summary.json", '{"final_return": "x"}'),
+    ],
+)
+def test_a_run_without_its_settings_or_summary_is_not_erased(train, tiny, tmp_path, name, text):
+    assert train(tiny).returncode == 0
+    file = only_run(tmp_path) / name
+    file.unlink() if text is None else file.write_text(text)
+    files = {path: path.read_bytes() for path in file.parent.iterdir()}
+    for flags in (tiny, f"{tiny} --resume"):
+        code = 2 if text == '{"args": []}' else 1
+        assert_one_line_error(train(flags), "--overwrite", code=code)
+    assert {path: path.read_bytes() for path in file.parent.iterdir()} == files
+    assert train(f"{tiny} --overwrite").returncode == 0
+
+
+@pytest.mark.parametrize("old, new", [("\n", "\r\n"), (",", ";"), ("\n512,", "\n513,")])
+def test_evaluations_that_were_edited_are_not_gone_on_with(train, tiny, tmp_path, old, new):
+    assert train(tiny).returncode == 0
+    file = only_run(tmp_path) / "evaluations.csv"
+    file.write_bytes(file.read_bytes().replace(old.encode(), new.encode()))
+    files = {path: path.read_bytes() for path in file.parent.iterdir()}
+    longer = tiny.replace("4096", "8192") + " --resume"
+    assert_one_line_error(train(longer), "evaluations.csv is not what it was", code=1)
+    assert {path: path.read_bytes() for path in file.parent.iterdir()} == files
+
+
+def test_a_user_without_a_name(monkeypatch):
+    """As in a container that is started with another uid."""
+
+    def getuser():
+        raise KeyError("getpwuid(): uid not found: 1234")
+
+    monkeypatch.setattr(run_files.getpass, "getuser", getuser)
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+    assert run_files._compile_cache().endswith(f"torchinductor_{os.getuid()}")
+
+
 def test_an_annealed_run_cannot_be_trained_longer(train, tiny, tmp_path):
     assert train(f"{tiny} --anneal-lr").returncode == 0
     longer = tiny.replace("4096", "8192") + " --anneal-lr --resume"
