@@ -12,6 +12,7 @@ import argparse
 import contextlib
 import json
 import os
+import sys
 import types
 from pathlib import Path
 
@@ -60,10 +61,15 @@ def read_run(folder, best=False):
     """
     file = folder / ("best.pt" if best else "checkpoint.pt")
     try:
-        args = run_files.ABSENT | json.loads((folder / "config.json").read_text())["args"]
+        config = json.loads((folder / "config.json").read_text())
+        args = run_files.ABSENT | config["args"]
         saved = torch.load(file, map_location="cpu", weights_only=True)
         acting = {"agent": saved["agent"], "normalization": saved.get("normalization", {})}
         acting["step"] = saved["step" if best else "global_step"]
+        ours, made_by = run_files.script(ppo.__file__), config.get("script")
+        if args["method"] == "ppo" and made_by and made_by["crc32"] != ours["crc32"]:
+            print(f"note: {made_by['name']} made this run, and is not the {ours['name']} here: "
+                  "with another network, this is another policy", file=sys.stderr)  # fmt: skip
         return types.SimpleNamespace(**args), acting
     except FileNotFoundError as error:
         if best and (folder / "checkpoint.pt").exists():

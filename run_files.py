@@ -422,7 +422,8 @@ class RunFolder:
             else:
                 self._clear()
                 config = {"args": self._args, "resolved": resolved, "versions": _versions()}
-                self._write_json("config.json", config | {"git_commit": _git_commit()})
+                config |= {"git_commit": _git_commit(), "script": script(sys.argv[0])}
+                self._write_json("config.json", config)
                 self._append("evaluations.csv", b"step,return_mean,return_std,length_mean\n")
             self._open_events()
         self._last_log = time.time(), step
@@ -661,6 +662,12 @@ def _versions():
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
     return versions
+
+
+def script(path):
+    """Name and checksum of a script, as config.json has those of the one that made the run."""
+    with contextlib.suppress(OSError):
+        return {"name": Path(path).name, "crc32": f"{zlib.crc32(Path(path).read_bytes()):08x}"}
 
 
 def _git_commit():

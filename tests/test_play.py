@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import types
+from unittest import mock
 
 import gymnasium as gym
 import imageio
@@ -32,7 +33,8 @@ FLAGS += "--env-kwargs g=5 --max-episode-steps 30 --learning-rate 1e-2"
 def trained(tmp_path_factory):
     """The folder of a run that has everything that play.py must heed."""
     runs = tmp_path_factory.mktemp("runs")
-    ppo.main(ppo.parse_args(f"{TINY} {FLAGS} --runs-dir {runs}".split()))
+    with mock.patch.object(sys, "argv", [ppo.__file__]):
+        ppo.main(ppo.parse_args(f"{TINY} {FLAGS} --runs-dir {runs}".split()))
     (config,) = runs.rglob("config.json")
     return config.parent
 
@@ -46,6 +48,17 @@ def play(folder, flags=""):
         except SystemExit as ended:
             code = ended.code
     return types.SimpleNamespace(returncode=code, stdout=out.getvalue(), stderr=err.getvalue())
+
+
+def test_a_run_of_another_script_is_named(trained, tmp_path):
+    """Its network may have been another, with parameters of the same shapes."""
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    config = json.loads((folder / "config.json").read_text())
+    for path, note in ((ppo.__file__, False), (__file__, True)):
+        config["script"] = run_files.script(path)
+        (folder / "config.json").write_text(json.dumps(config))
+        assert ("note: test_play.py made this run" in play(folder).stderr) == note
 
 
 def by_hand(folder, file="checkpoint.pt", beta=None, seed=1):
