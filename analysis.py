@@ -179,6 +179,8 @@ def read_packed(path):
         columns = [column for column in runs if column.isdecimal()]
         numbers = runs[[*WHOLE, "total_timesteps", "eval_freq"]]
         runs[[*text]]
+        if runs.empty:
+            raise ValueError("no run in it")
     except Exception as error:  # pandas and gzip raise nearly anything on what is not theirs
         reason = f"not a file that `analysis.py pack` wrote, or damaged: {error}"
         raise Unusable(f"{path} is {reason}") from None

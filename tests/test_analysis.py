@@ -656,7 +656,8 @@ def test_a_packed_file_that_is_cut_or_damaged_is_noticed(tmp_path, run):
     (tmp_path / "zeros.csv").write_bytes(bytes(1000))
     (tmp_path / "empty.csv").write_bytes(b"")
     (tmp_path / "header.csv").write_bytes(whole[: whole.index(b"total_timesteps")])
-    for name in ("cut.csv.gz", "no.csv.gz", "zeros.csv", "empty.csv", "header.csv"):
+    (tmp_path / "no_run.csv").write_bytes(whole[:first_row])
+    for name in ("cut.csv.gz", "no.csv.gz", "zeros.csv", "empty.csv", "header.csv", "no_run.csv"):
         code, _, stderr = run("plot.py results", tmp_path / name, "--out", tmp_path / "figures")
         assert code == 1 and stderr.startswith("error: ") and len(stderr.splitlines()) == 1
         assert f"{name} is not a file that `analysis.py pack` wrote, or damaged" in stderr
