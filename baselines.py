@@ -9,6 +9,7 @@ the paper's released code, and its text gives no hyperparameters, so the default
 Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
 """
 
+import functools
 import math
 import os
 import sys
@@ -23,6 +24,8 @@ import ppo_colored_continuous as ppo
 import run_files
 from environments import silence
 
+functional_call = functools.partial(torch.func.functional_call, tie_weights=False)  # as ppo_loss
+
 # --- A2C (Mnih et al. 2016): one step of the plain policy gradient for each short rollout
 
 
@@ -30,7 +33,7 @@ def a2c_loss(params, batch, agent, args):
     """The policy gradient's loss, as a function of the flat parameters; batch as in ppo_loss."""
     obs, actions, _, advantages, returns, _ = batch
     named = agent.unflatten(params)
-    logprobs, entropy, values = torch.func.functional_call(agent, named, (obs, actions))
+    logprobs, entropy, values = functional_call(agent, named, (obs, actions))
     policy_loss = -(advantages * logprobs).mean()
     value_loss = ((returns - values) ** 2).mean()
     loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
@@ -64,7 +67,7 @@ TARGET_KL, DAMPING, CG_STEPS, LINE_SEARCH_STEPS, SHRINK = 0.01, 0.1, 15, 10, 0.8
 def surrogate(params, batch, agent):
     """Mean of advantage times probability ratio, as a function of the flat parameters."""
     obs, actions, old_logprobs, advantages, *_ = batch
-    logprobs, *_ = torch.func.functional_call(agent, agent.unflatten(params), (obs, actions))
+    logprobs, *_ = functional_call(agent, agent.unflatten(params), (obs, actions))
     return (advantages * (logprobs - old_logprobs).exp()).mean()
 
 
@@ -77,7 +80,7 @@ def kl_divergence(params, old_params, obs, agent):
     def mean_and_log_std(params):
         named = agent.unflatten(params)
         actor = {k.split(".", 1)[1]: p for k, p in named.items() if k.startswith("actor_mean.")}
-        return torch.func.functional_call(agent.actor_mean, actor, obs), named["log_std"]
+        return functional_call(agent.actor_mean, actor, obs), named["log_std"]
 
     mean, log_std = mean_and_log_std(params)
     old_mean, old_log_std = mean_and_log_std(old_params)
@@ -122,7 +125,7 @@ def trpo_actor(params, batch, agent):
 
 def critic_loss(params, minibatch, agent):
     obs, actions, _, _, returns, _ = minibatch
-    *_, values = torch.func.functional_call(agent, agent.unflatten(params), (obs, actions))
+    *_, values = functional_call(agent, agent.unflatten(params), (obs, actions))
     loss = ((returns - values) ** 2).mean()
     return loss, {"value_loss": loss}
 

@@ -144,7 +144,7 @@ class Agent(nn.Module):
         return logprobs, entropy, self.critic(obs).squeeze(-1)
 
     def unflatten(self, params):
-        """The parameters by name, as views of the flat vector `params`, for functional_call."""
+        """Parameters by name, views of the flat `params`; a shared one once: tie_weights=False."""
         named = dict(self.named_parameters())
         pieces = params.split([p.numel() for p in named.values()])
         return {name: x.view(named[name].shape) for name, x in zip(named, pieces, strict=True)}
@@ -343,7 +343,7 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     if len(args.beta) not in (1, action_dim):
         fail(f"--beta has {len(args.beta)} values, {args.env_id} {action_dim} action dimensions", 2)
     run = RunFolder(args)
-    if run.summary is not None:
+    if run.summary:
         return print(f"complete: final return {run.summary['final_return']:.4g} in {run.path} "
                      "(--overwrite runs it again)")  # fmt: skip
     init_seed, noise_seed = make_seeds(2, args.seed, 0)

@@ -283,13 +283,6 @@ def numpy_policy(actor):
     numpy 6. Layers that are known here are computed in numpy; with any other the module is called,
     in eval mode. The weights are copied: make it anew when the module has learned.
     """
-
-    def called(obs):
-        training, device = actor.training, next(actor.parameters()).device
-        actions = actor.eval()(torch.as_tensor(obs, device=device)).cpu().numpy()
-        actor.train(training)
-        return actions
-
     activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0), nn.Identity: lambda x: x}
     layers = actor if type(actor) is nn.Sequential else [actor]
     functions = []
@@ -301,7 +294,8 @@ def numpy_policy(actor):
         elif type(layer) in activations and not hooks:
             functions.append(activations[type(layer)])
         else:
-            return called
+            device, module = next(actor.parameters()).device, copy.deepcopy(actor).eval()
+            return lambda obs: module(torch.as_tensor(obs, device=device)).cpu().numpy()
 
     def policy(obs):
         for function in functions:
@@ -584,8 +578,8 @@ class RunFolder:
         path = self.path / "checkpoint.pt"
         try:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-            size, _ = checkpoint["file_sizes"]["evaluations.csv"], checkpoint["wall_seconds"]
-            if "agent" not in checkpoint:
+            size = checkpoint["file_sizes"]["evaluations.csv"]
+            if not {"agent", "wall_seconds"} <= checkpoint.keys():
                 raise ValueError("it is of an earlier version of this code")
             rows = (self.path / "evaluations.csv").read_bytes()[:size].decode().split("\n")
             steps = range(self._args["eval_freq"], checkpoint["next_eval"], self._args["eval_freq"])
@@ -594,9 +588,10 @@ class RunFolder:
         except Exception as error:  # torch.load raises nearly anything on a damaged file
             reason = str(error).split(". ")[0][:100]
             fail(f"{path} is damaged ({reason}): restore it, or start again with --overwrite")
-        if checkpoint["next_eval"] < checkpoint["global_step"]:  # the last update went beyond it
+        next_eval, total = checkpoint["next_eval"], self._args["total_timesteps"]
+        if next_eval < checkpoint["global_step"] and next_eval <= total:
             fail(f"the run in {self.path} cannot be trained longer: the policy to evaluate at step "
-                 f"{checkpoint['next_eval']} is gone")  # fmt: skip
+                 f"{next_eval} is gone")  # fmt: skip
         return checkpoint
 
     @contextlib.contextmanager

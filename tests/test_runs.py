@@ -717,6 +717,11 @@ def test_a_run_that_learned_beyond_its_end_cannot_be_trained_longer(train, tiny,
     longer = uneven.replace("3600", "8192") + " --resume"
     assert_one_line_error(train(longer), "cannot be trained longer", "step 4000", code=1)
     assert {path: path.read_bytes() for path in only_run(tmp_path).iterdir()} == files
+    # Killed after its last update, before its summary, it is resumed to the same end
+    (only_run(tmp_path) / "summary.json").unlink()
+    process = train(f"{uneven} --resume")
+    assert process.returncode == 0, process.stderr
+    assert [row["step"] for row in read_evaluations(only_run(tmp_path))] == [*range(500, 3501, 500)]
 
 
 @pytest.mark.parametrize(
