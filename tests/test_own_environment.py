@@ -197,7 +197,8 @@ def test_arguments_of_the_environment(train, tmp_path, capsys):
     texts += ["a=x=y"]
     values = [parse(text)[1] for text in texts]
     assert values == [1, -2.5, True, False, [3, 0], "pick-place-v3", "1", "", "x=y"]
-    args = ppo.parse_args(["--env-kwargs", "low=0", "high=2", "--env-kwargs", "name=a b"])
+    flags = f"--runs-dir {tmp_path} --env-kwargs low=0 high=2 --env-kwargs".split()
+    args = ppo.parse_args([*flags, "name=a b"])  # not in runs/, where the user's own may be
     assert args.env_kwargs == {"low": 0, "high": 2, "name": "a b"} and not args.envpool
     env = make_env("PointPushMaze-v1", env_kwargs=dict([parse("goal=3,-2")]))
     assert tuple(env.unwrapped.goal) == (3, -2)

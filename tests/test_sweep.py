@@ -188,7 +188,7 @@ def test_other_methods(tmp_path):
     narrowed = shlex.split("--envs door --seeds 1 --n-envs 4")
     lines = printed("transfer", *narrowed, "--betas", "0.5") + printed("gsde", *narrowed)
     lines += printed("transfer", *narrowed, "--betas", "0.5", "--exp-name", "x")
-    words = [shlex.split(line.split(str(ROOT))[1]) for line in lines]
+    words = [shlex.split(line.split(f" {ROOT}")[1]) for line in lines]  # behind the interpreter
     assert [w[:2] for w in words[:3]] == [["/baselines.py", m] for m in ("trpo", "a2c", "gsde")]
     names = [w[w.index("--exp-name") + 1] for w in words]
     assert names == ["trpo", "a2c", "gsde", "x_trpo", "x_a2c"]
