@@ -56,7 +56,7 @@ def outside(table):
 
 
 def offset(runs):
-    """A line that says how far our final returns are from the published means, on average.
+    """Lines that say how far our final returns are from the published means, and in what tasks.
 
     On the scale of `on_published_scale`, over cells of two seeds and more. The interval is by
     seeds, of which the paper's 20 are taken to scatter as ours do: too narrow where few seeds of an
@@ -71,12 +71,16 @@ def offset(runs):
     )
     table = table[table.seeds > 1]
     if table.empty:
-        return "ours less the published: no cell with two seeds"
-    mean = (table["mean"] - table.paper).mean()
+        return ["ours less the published: no cell with two seeds"]
+    table["less"] = table["mean"] - table.paper
     by_cell = table.variance * (1 / table.seeds + 1 / 20) / len(table) ** 2
+    mean = table.less.mean()
     low, high = interval({"mean": mean} | summed(by_cell, table.seeds - 1))
     line = f"ours less the published {mean:z.2f} [{low:z.2f}, {high:z.2f}] on average over "
-    return line + f"{len(table)} cells, where the paper's lowest is 0 and its highest 1"
+    line += f"{len(table)} cells, where the paper's lowest is 0 and its highest 1"
+    tasks = table.groupby("environment").less.agg(["mean", "size"]).sort_values("mean")
+    each = [f"{name} {mean:z.2f} ({size} cells)" for name, mean, size in tasks.itertuples()]
+    return [line, ", ".join(each)]
 
 
 def summed(variances, df):
@@ -355,7 +359,8 @@ def more_n_envs_worse(runs):
         return "open", NONE
     x = np.log2(n) - np.log2(n).mean()
     weights = dict(zip(n, -x / (x**2).sum(), strict=True))
-    return positive(runs, "loss per doubling", weights, "n_envs", ["environment", "beta"])
+    what = f"loss per doubling, n_envs {', '.join(map(str, n))}:"
+    return positive(runs, what, weights, "n_envs", ["environment", "beta"])
 
 
 def pink_gains_with_n_envs(runs):

@@ -753,7 +753,7 @@ def draw_results(args):
     made, report["not made"] = make_all(todo, args.out)
     finals = made.get("final_returns")
     outside = [] if finals is None else [claims.outside(finals)[-1]]
-    outside += [claims.offset(grid)] if "beside_published" in made else []
+    outside += claims.offset(grid) if "beside_published" in made else []
     report["final returns beside the published"] = outside
     if earlier.startswith("made: "):
         remove(args.out, set(earlier.removeprefix("made: ").split(", ")) - set(made))

@@ -340,11 +340,16 @@ def test_how_far_from_the_published_on_average():
         sampled = runs.groupby(["environment", "beta"]).seed.transform(lambda s: rng.normal())
         noise = rng.normal(size=len(runs)) + sampled / 20**0.5
         runs["final_return"] = published + runs.environment.map(top) * (0.1 + 0.3 * noise)
-        line = claims.offset(runs)
+        line, tasks = claims.offset(runs)
         low, high = (float(x) for x in re.search(r"\[(\S+), (\S+)\]", line).groups())
         held.append(low - 0.005 <= 0.1 <= high + 0.005)
     assert "on average over 24 cells" in line and 0.88 <= np.mean(held) < 1
-    assert claims.offset(runs[runs.seed == 0]).endswith("no cell with two seeds")
+    assert claims.offset(runs[runs.seed == 0])[0].endswith("no cell with two seeds")
+    # The tasks are in order, and their average is the whole
+    each = [float(x) for x in re.findall(r" (-?[\d.]+) \(3 cells\)", tasks)]
+    whole = float(re.search(r"published (\S+)", line)[1])
+    assert len(each) == 8 and each == sorted(each)
+    assert np.mean(each) == pytest.approx(whole, abs=0.011)
 
 
 def test_published_means_far_off_are_more_than_chance():
