@@ -213,11 +213,12 @@ def test_the_claims_so_far_are_those_of_the_data(measured):
 @pytest.mark.parametrize(
     ("file", "varies"), [("noise_length.csv", "noise_seq_len"), ("new_seeds.csv", "batch_size")]
 )
-def test_ten_new_seeds_are_those_of_the_data(file, varies):
+def test_new_seeds_are_those_of_the_data(file, varies):
     text = section((ROOT / "results" / "README.md").read_text(), "Where the numbers differ")
     runs, _ = load([ROOT / "results" / file])
     runs = runs[runs.status == "complete"]
-    groups = [x for _, x in runs.groupby(["env_id", "beta", "n_envs", varies]) if len(x) == 10]
+    cell = ["env_id", "beta", "n_envs", varies, "bootstrap_timeouts", runs.seed // 100]
+    groups = [x for _, x in runs.groupby(cell) if len(x) >= 10]
     assert len(groups) >= 4
     for group in groups:
         mean, low, high = mean_interval(group.final_return)
