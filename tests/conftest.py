@@ -81,3 +81,11 @@ def train(tmp_path):
 def tiny():
     """Flags of a run of 8 updates and 8 evaluations that takes a second."""
     return TINY
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """With -n 2: the worker that is done first takes over tests of the other."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log)
