@@ -223,6 +223,12 @@ def test_new_seeds_are_those_of_the_data(file, varies):
     for group in groups:
         mean, low, high = mean_interval(group.final_return)
         assert f" {mean:z.1f} [{low:z.1f}, {high:z.1f}] |" in text
+    usual = (runs.beta == "0") & (runs.batch_size == 128) & ~runs.bootstrap_timeouts.astype(bool)
+    thirty = [x.final_return for _, x in runs[usual].groupby(["env_id", "n_envs"]) if len(x) == 30]
+    assert len(thirty) == (2 if varies == "batch_size" else 0)
+    for values in thirty:  # white noise in pendulum
+        mean, low, high = mean_interval(values)
+        assert f"at {mean:.0f} [{low:.0f}, {high:.0f}] (published" in text
 
 
 def test_the_table_of_agreement_is_the_data(measured):
