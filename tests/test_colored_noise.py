@@ -165,6 +165,19 @@ def test_a_state_is_small_and_continues_wherever_it_was_taken(n_sampled):
     assert len(big.getvalue()) < 20_000  # bytes; the sequences are 1.6 MB
 
 
+def test_on_a_gpu_where_there_is_one():
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    x = colored_noise(1, (2000, 1000), generator=torch.Generator(device).manual_seed(0))
+    assert x.device.type == device
+    psd = torch.fft.rfft(x.double()).abs().square().mean(0).cpu()
+    assert torch.allclose(psd, expected_psd(1, 1000), rtol=5 * (2 / 2000) ** 0.5)
+
+    process, other = (ColoredNoiseProcess(0.5, 3, 2, 10, device=device) for _ in range(2))
+    process.sample(7)
+    other.load_state_dict(process.state_dict())
+    assert torch.equal(process.sample(20), other.sample(20))
+
+
 def test_processes_without_a_seed_differ():
     first, second = (ColoredNoiseProcess(0.5, 2, 2, seq_len=10) for _ in range(2))
     assert not torch.equal(first.sample(10), second.sample(10))
