@@ -610,10 +610,15 @@ def test_full_disk(tmp_path):
 # ---- A real Slurm
 
 
+@functools.cache  # where only the commands are there, sinfo waits for nine seconds
+def slurm_answers():
+    command = ["sinfo", "--noheader"]
+    return shutil.which("sinfo") and not subprocess.run(command, capture_output=True).returncode
+
+
 @pytest.fixture
 def slurm():
-    command = ["sinfo", "--noheader"]
-    if shutil.which("sinfo") is None or subprocess.run(command, capture_output=True).returncode:
+    if not slurm_answers():
         assert os.environ.get("REQUIRE_SLURM") != "1", "REQUIRE_SLURM=1, but no Slurm answers"
         pytest.skip("no Slurm answers (tests/slurm.sh starts one)")
     # One test at a time: the node is too small for the tasks of two
