@@ -222,6 +222,7 @@ def load(paths, env=None, beta=None, n_envs=None):
             `final_return`.
         curves: rows with the index of `runs`, a column per environment step: the mean return
             evaluated there, or NaN.
+        Both are ordered by environment, beta, n_envs, n_steps, n_epochs and seed.
 
     Raises Unusable where there is nothing to read or nothing of a kind that is asked for, OSError
     where it cannot be read.
@@ -244,7 +245,7 @@ def load(paths, env=None, beta=None, n_envs=None):
     # Sec. "Evaluation Details": performance is the mean over all evaluations, the area under the
     # learning curve
     curves = curves.sort_index(axis=1)
-    runs["performance"] = curves.mean(axis=1)
+    runs["performance"] = curves.mean(axis=1).round(9)  # the digits behind depend on other rows
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1] if len(curves.columns) else np.nan
     env = env and [id_named(value, runs.env_id.dropna().unique()) or value for value in env]
     keep = pd.Series(True, runs.index)
@@ -258,7 +259,10 @@ def load(paths, env=None, beta=None, n_envs=None):
         asked = runs[columns].isin(wanted or []).any(axis=1) | (not wanted)
         keep &= asked | (flag == "beta") & (runs.method == "gsde")  # which has no beta
     keep |= runs.env_id.isna()  # damaged ones stay, to be listed
-    return runs[keep], curves[keep]
+    # Bootstraps draw by position: in whatever order runs are read, their intervals are the same
+    numbers = runs[keep][AXES[2:]].apply(pd.to_numeric, errors="coerce")
+    order = runs[AXES[:2]].astype(str).join(numbers, how="right").sort_values(AXES, kind="stable")
+    return runs.loc[order.index], curves.loc[order.index]
 
 
 def present(runs, flag):

@@ -663,6 +663,21 @@ def test_a_packed_file_that_is_cut_or_damaged_is_noticed(tmp_path, run):
         assert f"{name} is not a file that `analysis.py pack` wrote, or damaged" in stderr
 
 
+def test_intervals_do_not_depend_on_the_order_in_which_runs_are_read(tmp_path):
+    returns = np.random.default_rng(0).exponential(size=(12, 3))
+    for seed in range(1, 13):
+        write_run(tmp_path / f"{seed % 2}", PENDULUM, 0, 4, seed, returns[seed - 1])
+    first, second = (
+        analysis.load([tmp_path / a, tmp_path / b])[0] for a, b in (("0", "1"), ("1", "0"))
+    )
+    assert list(first.seed) == list(second.seed) == list(range(1, 13))
+    pd.testing.assert_frame_equal(
+        analysis.mean_intervals(first, "performance", "beta"),
+        analysis.mean_intervals(second, "performance", "beta"),
+        check_exact=True,
+    )
+
+
 def test_pack_does_not_overwrite(tmp_path, run):
     write_sweep(tmp_path / "runs", {0: 1}, seeds=2)
     a, b = tmp_path / "a.csv", tmp_path / "b.csv.gz"
