@@ -283,7 +283,7 @@ def contend(pipe, run, env_id):
     sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     try:
         run(Clock(pipe), env_id)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         pipe.send(f"{type(error).__name__}: {error}")
 
 
@@ -295,7 +295,10 @@ def measure(env_id, contenders, n_rounds, n_envs=N_ENVS):
     import pandas as pd
 
     def receive(name):
-        result = pipes[name].recv()
+        try:
+            result = pipes[name].recv()
+        except EOFError:
+            result = "its process has died: not enough memory?"
         if isinstance(result, str):
             print(f"note: nothing of {name} on {env_id} ({result})", file=sys.stderr)
             del pipes[name]
@@ -313,6 +316,7 @@ def measure(env_id, contenders, n_rounds, n_envs=N_ENVS):
         processes[name] = context.Process(target=contend, args=(pipe, run, env_id), daemon=True)
         start = time.perf_counter()
         processes[name].start()
+        pipe.close()  # here: the process has its own, and its death ends recv
         receive(name)
         startup[name] = time.perf_counter() - start
     for _ in range(1 + n_rounds):
@@ -377,8 +381,7 @@ def compare_threads(env_ids, n_cores, n_rounds):
             hold_on_cores(n)
             run = functools.partial(run_script, flags=f"--threads {n}")
             rows += measure(env_id, {f"one run, {n} core{'s'[: n > 1]}": run}, n_rounds)
-            rows[-1]["minutes"] = rows[-1]["total us"] * 2.048 / 60
-    return rows
+    return [row | {"minutes": row["total us"] * 2.048 / 60} for row in rows]
 
 
 def hold_on_cores(n):
@@ -388,7 +391,11 @@ def hold_on_cores(n):
 
 
 def main():
+    import gymnasium as gym
     import pandas as pd
+
+    import environments
+    from run_files import fail, one_line_for
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     dm_control = [f"dm_control/{t}-v0" for t in ("pendulum-swingup", "cheetah-run", "walker-run")]
@@ -400,6 +407,12 @@ def main():
     parser.add_argument("--thread-env-ids", nargs="*", default=threads, help="of the third table")
     parser.add_argument("--csv", default="benchmark.csv", help="file for the table")
     args = parser.parse_args()
+    environments.silence()
+    if not os.path.isdir(os.path.dirname(os.path.abspath(args.csv))):
+        fail(f"--csv {args.csv}: there is no such folder", 2)
+    for env_id in [*args.env_ids, *args.thread_env_ids]:
+        with one_line_for(gym.error.Error):
+            environments.make_env(env_id).close()
 
     hold_on_cores(1)
     tables = [functools.partial(compare, env_id, args.rounds) for env_id in args.env_ids]

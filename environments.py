@@ -228,6 +228,10 @@ def make_env(env_id, max_episode_steps=None, rescale_actions=False, env_kwargs=N
 
 def import_module_of(env_id, module):
     """Imports the module that registers an environment, from the current folder or installed."""
+    if not all(map(str.isidentifier, module.split("."))) or module.endswith(".py"):
+        raise gym.error.Error(
+            f"{env_id}: {module} is not the name of a module (that of my_env.py is my_env)"
+        )
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # behind all else: a file there must not hide a package
     try:

@@ -104,7 +104,14 @@ def full_id(word):
 def noise_color(word):
     """A beta as it is written in commands and folders: 0.50 is 0.5, and -0 is 0."""
     matching(r"auto|-?([0-9]+\.?[0-9]*|\.[0-9]+)")(word)
-    return word if word == "auto" else f"{float(word) + 0:g}"
+    if word == "auto":
+        return word
+    beta = f"{float(word) + 0:g}"
+    if float(beta) != float(word):
+        raise argparse.ArgumentTypeError(
+            f"'{word}' has more than six digits, which no folder's name shows"
+        )
+    return beta
 
 
 def parse_args(argv):

@@ -71,7 +71,7 @@ def read_run(folder, best=False):
             print(f"note: {made_by['name']} made this run, and is not the {ours['name']} here: "
                   "with another network, this is another policy", file=sys.stderr)  # fmt: skip
         return types.SimpleNamespace(**args), acting
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         if best and (folder / "checkpoint.pt").exists():
             fail(f"{folder} has no best.pt: it has not been evaluated, or is of an earlier version")
         example = "runs/ppo_colored_continuous/MountainCarContinuous-v0/beta_0.5/n_envs_4/seed_1"

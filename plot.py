@@ -745,7 +745,8 @@ def draw_results(args):
     asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
     betas = asked or three_betas(grid[~grid.vanilla])
     others = sorted(set(grid.beta.dropna()) - set(betas))
-    report["not among the learning curves (--beta chooses)"] = [f"beta {b:g}" for b in others]
+    others = [f"beta {b:g}" for b in others] + ["vanilla PPO, never"] * int(grid.vanilla.any())
+    report["not among the learning curves (--beta chooses)"] = others
     todo = results(methods, curves, betas)
     args.out.mkdir(parents=True, exist_ok=True)
     file = args.out / "report.txt"
@@ -777,7 +778,8 @@ def main():
     else:
         types = ["gif"] if args.command == "animation" else FigureCanvasBase.filetypes
         if args.out.suffix[1:] not in types or not args.out.parent.is_dir():
-            raise Unusable(f"--out {args.out} is not a picture's name in a folder that exists")
+            ends = "in .gif " if args.command == "animation" else "as a picture's does "
+            raise Unusable(f"--out {args.out} has to end {ends}and be in a folder that exists")
         silence()
         if args.command == "animation":
             animation(args.beta).save(args.out, PillowWriter(fps=15), dpi=100)

@@ -118,7 +118,7 @@ def number(kind, valid, description):
 
 NUMBERS = {  # the types of arguments; 1e15: floats are exact up to there, and it is enough
     "count": number(int, lambda x: 1 <= x < 1e15, "a positive whole number"),
-    "whole": number(int, lambda x: 0 <= x < 2**64, "a whole number >= 0"),
+    "whole": number(int, lambda x: 0 <= x < 2**63, "a whole number >= 0 and < 2^63"),
     "at_least_2": number(int, lambda x: 2 <= x < 1e15, "a whole number >= 2"),
     "positive": number(float, lambda x: x > 0, "a positive number"),
     "fraction": number(float, lambda x: 0 <= x <= 1, "between 0 and 1"),
@@ -430,7 +430,8 @@ class RunFolder:
             if self._state:  # else it is stopped before anything was learned
                 with self._one_line_errors():
                     self._write_checkpoint()
-            print("stopped: the same command with --resume goes on from here", file=sys.stderr)
+            resume = "--resume" + " in place of --overwrite" * self._args["overwrite"]
+            print(f"stopped: the same command with {resume} goes on from here", file=sys.stderr)
 
     def seconds(self):
         """Wall-clock seconds that the run has taken, over all its processes."""

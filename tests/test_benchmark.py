@@ -1,12 +1,14 @@
 """The benchmark: contenders do a round's work, its time is in its phases, the table adds up."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, run_forked
 
 from benchmark import PHASES, measure
 
@@ -98,8 +100,17 @@ def broken(clock, env_id):
     raise ValueError(f"cannot run {env_id}")
 
 
+def ended(clock, env_id):
+    sys.exit(2)
+
+
+def killed(clock, env_id):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def test_table(capsys):
-    rows = measure("some-env", {"fake": slow_then_fast, "broken": broken}, n_rounds=3)
+    contenders = {"fake": slow_then_fast, "broken": broken, "ended": ended, "killed": killed}
+    rows = measure("some-env", contenders, n_rounds=3)
     assert [row["contender"] for row in rows] == ["fake"]
     (row,) = rows
     ms_per_step = 1e3 / 8192  # of a round of a millisecond, in us per step
@@ -108,4 +119,19 @@ def test_table(capsys):
     assert row["total us"] == pytest.approx((30 + 3 + 3 * 0.8) * ms_per_step, rel=1e-2)
     assert row["from"] == pytest.approx(row["total us"] * 2 / 3, rel=1e-2)
     assert row["peak MB"] > 5 and row["start-up s"] > 0
-    assert "cannot run some-env" in capsys.readouterr().err
+    notes = capsys.readouterr().err
+    assert "nothing of broken on some-env (ValueError: cannot run some-env)" in notes
+    assert "nothing of ended" in notes and "nothing of killed" in notes
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ("--env-ids nosuch-v0", "unknown environment nosuch-v0"),
+        ("--csv /nosuch/table.csv", "--csv /nosuch/table.csv: there is no such folder"),
+    ],
+)
+def test_mistakes_are_one_line(flags, words, tmp_path):
+    process = run_forked(ROOT / "benchmark.py", flags.split(), tmp_path, timeout=60)
+    assert process.returncode == 2 and process.stderr.count("\n") == 1
+    assert words in process.stderr

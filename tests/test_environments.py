@@ -61,7 +61,12 @@ def run(code, folder):
         ("no_such_module:Mine-v0", ["no no_such_module.py in the current folder"]),
         ("no_such.module:Mine-v0", ["no package no_such.module"]),
         ("mazes:PointUMazes-v1", ["mazes:PointUMazes-v1; did you mean mazes:PointUMaze-v1"]),
-        ("a:b:c", ["no a:b.py"]),
+        ("a:b:c", ["a:b is not the name of a module"]),
+        ("./my_env:Mine-v0", ["./my_env is not the name of a module"]),
+        (
+            "my_env.py:Mine-v0",
+            ["my_env.py is not the name of a module (that of my_env.py is my_env)"],
+        ),
         ("CartPole-v1", ["Discrete(2)"]),
         ("Pendulum-v0", ["deprecated"]),
         ("", ["Malformed"]),

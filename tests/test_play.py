@@ -146,6 +146,7 @@ def test_wrong_folders(trained, tmp_path):
 
     assert "give the folder of one run, such as" in error(tmp_path)
     assert "give the folder of one run, such as" in error(tmp_path / "nowhere", "--best")
+    assert "give the folder of one run, such as" in error(trained / "checkpoint.pt")
     copy = tmp_path / "copy"
     shutil.copytree(trained, copy)
     (copy / "best.pt").unlink()

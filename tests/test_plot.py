@@ -344,6 +344,11 @@ def test_three_betas_by_default_and_their_lines_carry_markers(tmp_path, run):
         plt.close(fig)
     _, stdout, _ = run("plot.py results", tmp_path, "--out", tmp_path / "figures")
     assert "not among the learning curves (--beta chooses): 5\n  beta -1\n" in stdout
+    write_sweep(tmp_path, {"vanilla": 1}, seeds=2)
+    _, stdout, _ = run(
+        "plot.py results", tmp_path, "--beta", "0", "vanilla", "--out", tmp_path / "figures"
+    )
+    assert "not among the learning curves (--beta chooses): 1\n  vanilla PPO, never\n" in stdout
     assert plot.three_betas(runs[runs.beta.isin([-1, 0.2, 0.5, 2])]) == [-1, 0.2, 0.5]
 
 

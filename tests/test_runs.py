@@ -236,11 +236,12 @@ def test_resume_goes_on_with_the_same_networks_noise_and_clock(train, tiny, tmp_
 
 
 def test_ctrl_c(tiny, tmp_path):
-    process = start(tmp_path, tiny)
+    process = start(tmp_path, f"{tiny} --overwrite")
     wait_for_rows(tmp_path, 2, process)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate()
-    assert process.returncode == 130 and "--resume" in stderr and "Traceback" not in stderr
+    assert process.returncode == 130 and "Traceback" not in stderr
+    assert "the same command with --resume in place of --overwrite goes on from here" in stderr
     assert torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)["global_step"] >= 512
 
 

@@ -295,7 +295,7 @@ WRONG += [
 ]
 WRONG += ["vanilla --betas 0", "main --n-epochs 5", "main --print --slurm", "main --exp-name a/b"]
 WRONG += ["main --runs-per-task x", "n_steps --n-envs 3", "main -- --seed 3", "main -- --overwrite"]
-WRONG += ["n_steps -- --n-steps=5"]
+WRONG += ["n_steps -- --n-steps=5", "main --betas 1.23456789"]
 
 
 @pytest.mark.parametrize("args", WRONG)
