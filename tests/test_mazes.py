@@ -554,6 +554,16 @@ def test_point_pushes_the_block():
     assert y[-1] == pytest.approx(4 + env.data.qpos[4]) and abs(x).max() < 0.01 and (z == 1).all()
 
 
+def test_fast_the_point_drives_through_the_block_as_in_the_original():
+    env = make("PointPush-v1")
+    place(env, 0, 0)
+    env.data.qpos[2] = math.pi / 2
+    for step in range(1, 11):
+        obs, _, terminated, *_ = env.step([0.9, 0])
+        assert terminated == (step == 10)  # at y = 9, less than 0.6 from the goal
+    assert abs(obs[4] - 3.9) < 0.1  # where the original's is then
+
+
 def test_ant_pushes_the_block():
     env = make("AntPush-v1")
     place(env, 0, 2.5, v1=2)  # the block's face is at y = 4
