@@ -210,6 +210,27 @@ def test_the_claims_so_far_are_those_of_the_data(measured):
     assert all(low in text for low in tasks.split(", ")[:2])
 
 
+def test_the_slices_are_those_of_the_data():
+    text = section((ROOT / "results" / "README.md").read_text(), "Slices of the appendix")
+    names = ("reproduction.csv", "study.csv", "slices.csv")
+    loaded, curves = load([ROOT / "results" / name for name in names])
+    methods, _ = select_methods(loaded)
+    coverage = claims.coverage(methods, curves)
+    about = coverage[coverage["where"].isin(["Fig. A6", "Fig. A8", "Fig. A11", "Fig. A12"])]
+    assert len(about) == 5 and (about.verdict == "open").all()
+    for row in about[["where", "says", "data"]].to_numpy():
+        assert f"| {' | '.join(row)} |" in text
+    runs = methods["ppo"]
+    usual = (runs.n_envs == 4) & (runs.n_steps == 2048) & (runs.n_epochs == 10)
+    half = runs.beta == 0.5
+    columns = [usual & runs.vanilla, usual & (runs.beta == 0), usual & half]
+    columns += [half & (runs.n_steps == n) for n in (4096, 1024)]
+    columns += [half & (runs.n_epochs == n) for n in (5, 20)]
+    for name in ("Mountain Car", "Pendulum Swingup", "Cartpole Balance", "Reacher Hard"):
+        here = [runs[column & (runs.environment == name)].performance.mean() for column in columns]
+        assert f"| {' | '.join([name, *(f'{x:z.1f}' for x in here)])} |" in text
+
+
 @pytest.mark.parametrize(
     ("file", "varies"), [("noise_length.csv", "noise_seq_len"), ("new_seeds.csv", "batch_size")]
 )
