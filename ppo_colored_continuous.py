@@ -74,7 +74,7 @@ def parse_args(argv=None, **defaults):
     add = parser.add_argument_group("running").add_argument
     add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
     add("--threads", type="count", default=run_files.n_cores(), help="of evaluation and EnvPool")
-    add("--compile", action=flag, default=True, help="compile the update: half a minute, once")
+    add("--compile", action=flag, default=True, help="compile the update: 15 seconds, once")
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
     add("--exp-name", default="ppo_colored_continuous", help="the experiment, a folder's name")
     add("--runs-dir", default="runs", help="folder of all runs")

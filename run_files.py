@@ -314,7 +314,7 @@ def compiled(function):
     how = {"fullgraph": True, "dynamic": False, "isolate_recompiles": True}
     # cpp_wrapper calls the kernels from C++ instead of Python: 13 % less time in an update
     functions = [torch.compile(function, **how, options={"cpp_wrapper": True})]
-    text = "compiling the update: about 20 seconds, once per machine ..."
+    text = "compiling the update: a quarter of a minute, once per machine ..."
     seconds = 5 if os.path.isdir(_compile_cache()) and os.listdir(_compile_cache()) else 0
     wait = [threading.Timer(seconds, tqdm.write, [text])] if sys.stdout.isatty() else []
 
