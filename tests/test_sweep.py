@@ -43,11 +43,6 @@ elif "--help" not in sys.argv:
     folder = os.path.dirname(os.readlink("/proc/self/fd/1"))
     exec(os.environ["FAKE_RUN"])
 """
-# Is python, but for the sweep's question whether it can run the script: each takes three seconds
-ASSURING_PYTHON = f"""#!/bin/sh
-for word; do [ "$word" = --help ] && exit; done
-exec {shlex.quote(sys.executable)} "$@"
-"""
 # What the second start of a run finishes, and the first one does not before there is a file "go"
 ONCE_MORE = """
 if open(folder + "/log.txt").read().count("== ") == 1:
@@ -91,7 +86,6 @@ class Tiny:
 
     def __init__(self, runs, seeds="1", betas="0", steps=STEPS):
         self.runs, self.steps, self.env = runs, steps, ENV
-        self.use_python("assuring_python", ASSURING_PYTHON)
         self.args = ["quick", "--seeds", seeds, "--betas", betas, "--runs-dir", str(runs)]
         self.folders = [
             runs / MOUNTAIN_CAR / f"beta_{b}/n_envs_4/seed_{s}"
@@ -99,16 +93,12 @@ class Tiny:
             for b in betas.split()
         ]
 
-    def use_python(self, name, text):
-        python = self.runs.parent / name
-        python.write_text(text)
-        python.chmod(0o755)
-        self.env = {**self.env, "PYTHON": str(python)}
-
     def fake(self, code):
         """Every run is this code instead of training."""
-        self.use_python("fake_python", FAKE_PYTHON)
-        self.env["FAKE_RUN"] = code
+        python = self.runs.parent / "fake_python"
+        python.write_text(FAKE_PYTHON)
+        python.chmod(0o755)
+        self.env = {**ENV, "PYTHON": str(python), "FAKE_RUN": code}
 
     def run(self, *args):
         return sweep(*self.args, *args, "--", *TINY, str(self.steps), env=self.env)
@@ -560,7 +550,7 @@ def test_stopped_sweep_saves_and_tells_how_to_go_on(tmp_path, by):
     os.close(terminal)
     assert process.returncode == {"Ctrl-C": 130, "SIGTERM": 143}[by]
     (command,) = re.findall("^to go on: (.*)\r", output, re.M)
-    python = f"PYTHON={tiny.env['PYTHON']}"
+    python = f"PYTHON={sys.executable}"
     assert shlex.split(command) == [python, SWEEP, *tiny.args, "-j", "2", "--", *TINY, "2048000"]
     for folder in tiny.folders:
         assert not is_locked(folder)
