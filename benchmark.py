@@ -410,7 +410,7 @@ def main():
     environments.silence()
     if not os.path.isdir(os.path.dirname(os.path.abspath(args.csv))):
         fail(f"--csv {args.csv}: there is no such folder", 2)
-    for env_id in [*args.env_ids, *args.thread_env_ids]:
+    for env_id in dict.fromkeys([*args.env_ids, *args.thread_env_ids]):
         with one_line_for(gym.error.Error):
             environments.make_env(env_id).close()
 
@@ -423,7 +423,9 @@ def main():
         tables.append(functools.partial(compare_threads, *how))
     rows = []
     for make_rows in tables:
-        rows += (table := make_rows())
+        if not (table := make_rows()):  # its notes have said why
+            continue
+        rows += table
         pd.DataFrame(rows).round(3).to_csv(args.csv, index=False)
         table = pd.DataFrame(table).set_index(["env_id", "contender", "n_envs"])
         digits = {

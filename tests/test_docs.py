@@ -187,13 +187,17 @@ def test_which_beta():
         assert round(std, 2) == said and f"{said}" in text
 
 
-@pytest.fixture(scope="module")
-def measured():
-    """Our runs of the study's grid, by method, and what they say of the paper's claims."""
-    data = [ROOT / "results" / name for name in ("reproduction.csv", "study.csv")]
-    loaded, curves = load(data)
+def say(*names):
+    """Runs of files in results, by method, and what they say of the paper's claims."""
+    loaded, curves = load([ROOT / "results" / name for name in names])
     methods, _ = select_methods(loaded)
     return methods, claims.coverage(methods, curves)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """Our runs of the study's grid."""
+    return say("reproduction.csv", "study.csv")
 
 
 def test_the_claims_so_far_are_those_of_the_data(measured):
@@ -212,10 +216,7 @@ def test_the_claims_so_far_are_those_of_the_data(measured):
 
 def test_the_slices_are_those_of_the_data():
     text = section((ROOT / "results" / "README.md").read_text(), "Slices of the appendix")
-    names = ("reproduction.csv", "study.csv", "slices.csv")
-    loaded, curves = load([ROOT / "results" / name for name in names])
-    methods, _ = select_methods(loaded)
-    coverage = claims.coverage(methods, curves)
+    methods, coverage = say("reproduction.csv", "study.csv", "slices.csv")
     about = coverage[coverage["where"].isin(["Fig. A6", "Fig. A8", "Fig. A11", "Fig. A12"])]
     assert len(about) == 5 and (about.verdict == "open").all()
     for row in about[["where", "says", "data"]].to_numpy():
