@@ -43,6 +43,11 @@ elif "--help" not in sys.argv:
     folder = os.path.dirname(os.readlink("/proc/self/fd/1"))
     exec(os.environ["FAKE_RUN"])
 """
+# Is python, but for the sweep's question whether it can run the script: each takes three seconds
+ASSURING_PYTHON = f"""#!/bin/sh
+for word; do [ "$word" = --help ] && exit; done
+exec {shlex.quote(sys.executable)} "$@"
+"""
 # What the second start of a run finishes, and the first one does not before there is a file "go"
 ONCE_MORE = """
 if open(folder + "/log.txt").read().count("== ") == 1:
@@ -50,10 +55,12 @@ if open(folder + "/log.txt").read().count("== ") == 1:
         time.sleep(0.1)
 """
 FINISH = "print('{\"wall_seconds\": 9}', file=open(folder + '/summary.json', 'w'))"
-# Makes stdin the terminal that Ctrl-C comes from, and becomes the command
+# Makes stdin the terminal that Ctrl-C comes from, and becomes the command. A suite that was started
+# in the background ignores Ctrl-C, and what it starts would, too.
 ON_TERMINAL = """
-import fcntl, os, sys, termios
+import fcntl, os, signal, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+signal.signal(signal.SIGINT, signal.SIG_DFL)
 os.execv(sys.argv[1], sys.argv[1:])
 """
 
@@ -86,6 +93,7 @@ class Tiny:
 
     def __init__(self, runs, seeds="1", betas="0", steps=STEPS):
         self.runs, self.steps, self.env = runs, steps, ENV
+        self.use_python("assuring_python", ASSURING_PYTHON)
         self.args = ["quick", "--seeds", seeds, "--betas", betas, "--runs-dir", str(runs)]
         self.folders = [
             runs / MOUNTAIN_CAR / f"beta_{b}/n_envs_4/seed_{s}"
@@ -93,12 +101,16 @@ class Tiny:
             for b in betas.split()
         ]
 
+    def use_python(self, name, text):
+        python = self.runs.parent / name
+        python.write_text(text)
+        python.chmod(0o755)
+        self.env = {**self.env, "PYTHON": str(python)}
+
     def fake(self, code):
         """Every run is this code instead of training."""
-        python = self.runs.parent / "fake_python"
-        python.write_text(FAKE_PYTHON)
-        python.chmod(0o755)
-        self.env = {**ENV, "PYTHON": str(python), "FAKE_RUN": code}
+        self.use_python("fake_python", FAKE_PYTHON)
+        self.env["FAKE_RUN"] = code
 
     def run(self, *args):
         return sweep(*self.args, *args, "--", *TINY, str(self.steps), env=self.env)
@@ -550,7 +562,7 @@ def test_stopped_sweep_saves_and_tells_how_to_go_on(tmp_path, by):
     os.close(terminal)
     assert process.returncode == {"Ctrl-C": 130, "SIGTERM": 143}[by]
     (command,) = re.findall("^to go on: (.*)\r", output, re.M)
-    python = f"PYTHON={sys.executable}"
+    python = f"PYTHON={tiny.env['PYTHON']}"
     assert shlex.split(command) == [python, SWEEP, *tiny.args, "-j", "2", "--", *TINY, "2048000"]
     for folder in tiny.folders:
         assert not is_locked(folder)
