@@ -12,10 +12,12 @@ Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
 import functools
 import math
 import os
+import signal
 import sys
 
 if __name__ == "__main__":
     os.environ["OMP_NUM_THREADS"] = "1"  # for these small networks more threads are slower
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while loading: no traceback
 
 import torch
 from torch import nn

@@ -12,12 +12,14 @@ import argparse
 import contextlib
 import json
 import os
+import signal
 import sys
 import types
 from pathlib import Path
 
 if __name__ == "__main__":
     os.environ["OMP_NUM_THREADS"] = "1"  # for these small networks more threads are slower
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while loading: no traceback
 
 import gymnasium as gym
 import numpy as np

@@ -14,14 +14,14 @@ is due, collect a batch, learn from it, write it down.
 import argparse
 import math
 import os
+import signal
 import sys
-import threading
 
 if __name__ == "__main__":
     os.environ["OMP_NUM_THREADS"] = "1"  # for these small networks more threads are slower
-    loading = threading.Timer(2, print, ["loading PyTorch and the environments ..."])
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while loading: no traceback
     if sys.stdout.isatty():
-        loading.start()
+        print("loading PyTorch and the environments ...")
 
 import gymnasium as gym
 import numpy as np
@@ -419,7 +419,6 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
 
 
 if __name__ == "__main__":
-    loading.cancel()
     environments.silence()
     run_files.catch_signals()
     main(parse_args())

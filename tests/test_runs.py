@@ -245,6 +245,19 @@ def test_ctrl_c(tiny, tmp_path):
     assert torch.load(only_run(tmp_path) / "checkpoint.pt", weights_only=True)["global_step"] >= 512
 
 
+@pytest.mark.parametrize("script", ["ppo_colored_continuous", "baselines", "play"])
+def test_ctrl_c_while_loading(script, tmp_path):
+    for package in ("gymnasium", "torch"):  # these are imported in place of the real ones
+        code = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+        (tmp_path / f"{package}.py").write_text(code)
+    process = subprocess.run(
+        [sys.executable, ROOT / f"{script}.py"],
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert (process.returncode, process.stderr) == (-signal.SIGINT, b"")
+
+
 def test_a_finished_run_is_not_run_again(train, tiny, tmp_path):
     assert train(tiny).returncode == 0
     files = {path: path.read_bytes() for path in only_run(tmp_path).iterdir()}
