@@ -18,6 +18,7 @@ import re
 import sys
 import warnings
 from collections import Counter, defaultdict
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from colored_noise import mean_std
-from environments import NAMES, id_named
+from environments import NAMES, ids_named
 from run_files import ABSENT, FREE_ARGS, fail
 
 try:
@@ -44,11 +45,14 @@ STUDY = {
     "noise_seq_len": 1000, "n_steps": 2048, "batch_size": 128, "n_epochs": 10, "gamma": 0.99,
     "learning_rate": 2.5e-4, "anneal_lr": False, "gae_lambda": 0.95, "clip_range": 0.2,
     "normalize_advantage": True, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5,
+    "env_kwargs": None, "rescale_actions": False, "normalize_obs": False,
+    "normalize_rewards": False,
 }
 # fmt: on
 # What methods have in common that are compared
 SHARED = ["total_timesteps", "eval_freq", "max_episode_steps", "noise_seq_len", "gamma"]
-SHARED += ["anneal_lr", "bootstrap_timeouts"]
+SHARED += ["anneal_lr", "bootstrap_timeouts", "env_kwargs", "rescale_actions", "normalize_obs"]
+SHARED += ["normalize_rewards"]
 # The study varies AXES. Other arguments must not vary within an environment, but these: EVALUATION
 # changes how closely a policy's return is measured, and not what its mean is; FREE_ARGS change
 # nothing; NOT_ARGUMENTS are no arguments, or shown by others.
@@ -87,6 +91,11 @@ def betas_text(text):
     if not all(map(math.isfinite, betas)):
         raise ValueError(f"beta {text} is not finite")
     return "_".join(map(beta_text, betas)) or text
+
+
+def by_beta(texts):
+    """Texts as of `betas_text` in the order of their (first) betas, "vanilla" last."""
+    return sorted(texts, key=lambda text: float(text.replace("vanilla", "inf").split("_")[0]))
 
 
 def run_folders(root, marks):
@@ -129,6 +138,7 @@ def read_run(folder):
         known = {"env_id": str(args["env_id"]), "beta": betas_text(beta)}
         expected = int(args["total_timesteps"]) // int(args["eval_freq"])
         run = {**args, **whole, **known, "git_commit": config["git_commit"]}
+        run["script"] = config.get("script", {}).get("name")
         if args.get("env_kwargs") is not None:
             run["env_kwargs"] = json.dumps(args["env_kwargs"], sort_keys=True)
         rows = (folder / "evaluations.csv").read_text().splitlines()[1:]
@@ -203,7 +213,7 @@ def read_packed(path):
             runs.loc[row, "beta"] = betas_text(beta)
         except ValueError:
             damaged[row] = f"beta {beta}"
-    if len(runs) and not data.endswith(b"\n"):  # the last number may lack digits
+    if not data.endswith(b"\n"):  # the last number may lack digits
         damaged.iloc[-1] = f"cut off in evaluation {found.iloc[-1]}"
     cut = ~runs.status.str.match("complete$|unfinished:|damaged:", na=False)
     runs.loc[cut | (runs.status == "complete") & (damaged != ""), "status"] = "damaged: " + damaged
@@ -232,12 +242,16 @@ def load(paths, env=None, beta=None, n_envs=None):
         runs, curves = read_folder(path) if path.is_dir() else read_packed(path)
         if runs.empty:
             made_by = "ppo_colored_continuous.py and run_sweep.sh make them"
-            raise Unusable(f"no runs in {path}: {made_by}")
+            failed = "`analysis.py status` lists those that failed at once"
+            raise Unusable(f"no runs in {path}: {made_by}, {failed}")
         tables.append((runs.assign(source=str(path)), curves))
     runs, curves = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
-    runs = runs.reindex(columns=runs.columns.union(["env_id", *AXES, *ABSENT], sort=False))
+    needed = ["env_id", "script", *AXES, *ABSENT]
+    runs = runs.reindex(columns=runs.columns.union(needed, sort=False))
     for argument, value in ABSENT.items():
         runs[argument] = runs[argument].astype(object).where(runs[argument].notna(), value)
+    usual = runs.method.map({"ppo": "ppo_colored_continuous.py"}).fillna("baselines.py")
+    runs["script"] = runs.script.astype(object).fillna(usual)  # older runs do not say
     # gSDE does not use the beta of its arguments
     runs["beta"] = runs.beta.astype(object).mask(runs.method == "gsde", "gsde")
     names = runs.env_id.map(lambda env_id: NAMES.get(env_id, env_id), na_action="ignore")
@@ -247,7 +261,8 @@ def load(paths, env=None, beta=None, n_envs=None):
     curves = curves.sort_index(axis=1)
     runs["performance"] = curves.mean(axis=1).round(9)  # the digits behind depend on other rows
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1] if len(curves.columns) else np.nan
-    env = env and [id_named(value, runs.env_id.dropna().unique()) or value for value in env]
+    ids = runs.env_id.dropna().unique()
+    env = env and [env_id for value in env for env_id in ids_named(value, ids) or [value]]
     keep = pd.Series(True, runs.index)
     for flag, wanted in (("env", env), ("beta", beta), ("n_envs", n_envs)):
         columns = ["environment", "env_id"] if flag == "env" else [flag]
@@ -258,6 +273,7 @@ def load(paths, env=None, beta=None, n_envs=None):
                 raise Unusable(f"no runs with --{flag} {value}; there are: {there or 'none'}")
         asked = runs[columns].isin(wanted or []).any(axis=1) | (not wanted)
         keep &= asked | (flag == "beta") & (runs.method == "gsde")  # which has no beta
+    need(keep.any(), "runs that have all of --env, --beta and --n-envs: there are none")
     keep |= runs.env_id.isna()  # damaged ones stay, to be listed
     # Bootstraps draw by position: in whatever order runs are read, their intervals are the same
     numbers = runs[keep][AXES[2:]].apply(pd.to_numeric, errors="coerce")
@@ -270,8 +286,7 @@ def present(runs, flag):
     values = runs[{"env": "environment"}.get(flag, flag)].dropna().unique()
     if flag != "beta":
         return sorted(values)
-    values = [text for text in values if text != "gsde"]
-    return sorted(values, key=lambda text: float(text.replace("vanilla", "inf").split("_")[0]))
+    return by_beta([text for text in values if text != "gsde"])
 
 
 def pack(runs, curves, file, inputs=(), overwrite=False):
@@ -316,7 +331,9 @@ def value_text(value):
 
 
 def flag_text(argument, text):
-    """An argument as one types it: "--gamma 0.9", "--envpool", "no --envpool"."""
+    """An argument as one types it: "--gamma 0.9", "--envpool", "no --envpool"; a script's name."""
+    if argument == "script":
+        return text
     flag = f"--{argument.replace('_', '-')}"
     return {"True": flag, "False": f"no {flag}", "None": f"no {flag}"}.get(text, f"{flag} {text}")
 
@@ -325,8 +342,9 @@ def select(runs, method="ppo"):
     """Chooses the runs to average: complete, of one method, each setting and seed once.
 
     Returns them, with `beta` a number (NaN for vanilla PPO), and a line for each that is left out.
-    Raises Unusable where there are none, or where another argument than those that are listed at
-    the top of this file varies within an environment.
+    Raises Unusable where there are none, or where the script or another argument than those that
+    are listed at the top of this file varies within an environment, or the same settings and seed
+    are in two experiments: of one of them the script may have been edited.
     """
     status = runs.status.copy()
     other = (status == "complete") & (runs.method != method)
@@ -341,9 +359,10 @@ def select(runs, method="ppo"):
     if chosen.empty:
         what = f"no complete run of these environments, betas and n_envs with the method {method}"
         raise Unusable("; ".join([what, *left_out[:1]]))
-    not_compared = {*AXES, *EVALUATION, *FREE_ARGS, *NOT_ARGUMENTS}
-    for environment, group in complete.groupby("environment"):
-        for argument in group.columns.difference(not_compared):
+    compared = complete.columns.difference([*AXES, *EVALUATION, *FREE_ARGS, *NOT_ARGUMENTS])
+    twice = complete[complete.duplicated(AXES, keep=False)]
+    for part, arguments in ((complete, compared), (twice, ["exp_name"])):
+        for (environment, group), argument in product(part.groupby("environment"), arguments):
             values = sorted(set(map(value_text, group[argument])))
             if len(values) > 1:
                 mix = " and ".join(flag_text(argument, value) for value in values[:3])
@@ -375,10 +394,10 @@ def select_methods(runs, method="ppo"):
     return chosen, left_out
 
 
-def same_protocol(runs):
+def same_protocol(runs, arguments=SHARED):
     """The runs; raises Unusable where methods to compare differ in what they share."""
     for environment, group in runs.groupby("environment"):
-        for argument in SHARED:
+        for argument in arguments:
             texts = sorted(set(group[argument].map(value_text))) if argument in group else []
             if len(texts) > 1:
                 flags = " and ".join(flag_text(argument, text) for text in texts[:3])
@@ -557,23 +576,29 @@ def cells_intervals(runs, column, by, cells):
     return table.rename_axis(by)
 
 
+def weighted(x, weights=None):
+    """Mean, standard deviation and size of a sample, (runs,) or (samples, runs), for `welch`.
+
+    A weighted sample counts as 1 / sum(weights^2) runs (Kish).
+    """
+    x = np.asarray(x, float)
+    w = np.ones(x.shape[-1]) if weights is None else np.asarray(weights, float)
+    w = w / w.sum()
+    mean, squares = x @ w, (w**2).sum()
+    variance = (x - mean[..., None]) ** 2 @ w / (1 - squares)
+    return mean, variance**0.5, 1 / squares
+
+
 def welch(a, b, weights_a=None, weights_b=None):
     """p-value of Welch's t-test (Table 1), of weighted means where there are weights.
 
-    A weighted sample counts as 1 / sum(weights^2) runs (Kish). NaN with fewer than two runs on a
-    side, 1 where all values are the same.
+    NaN with fewer than two runs on a side, 1 where all values are the same.
     """
     if min(len(a), len(b)) < 2:
         return np.nan
     if np.ptp([*a, *b]) == 0:
         return 1.0
-    sides = []
-    for x, weights in ((a, weights_a), (b, weights_b)):
-        w = np.ones(len(x)) if weights is None else np.asarray(weights, float)
-        w = w / w.sum()
-        mean = (w * x).sum()
-        std = np.sqrt((w * (x - mean) ** 2).sum() / (1 - (w**2).sum()))
-        sides += [mean, std, 1 / (w**2).sum()]
+    sides = [*weighted(a, weights_a), *weighted(b, weights_b)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # scipy's, about values nearly the same
         return stats.ttest_ind_from_stats(*sides, equal_var=False).pvalue
@@ -724,7 +749,7 @@ def final_return_per_beta(table):
         if "differs" in cells:
             row["differs"] = "; ".join(sorted(set(cells.differs) - {""}))
         rows.append(row)
-    columns = [f"{of} {beta}" for beta in sorted(table.beta.unique()) for of in ("beta", "paper,")]
+    columns = [f"{of} {beta}" for beta in by_beta(table.beta.unique()) for of in ("beta", "paper,")]
     differs = ["differs"] if "differs" in table else []
     return pd.DataFrame(rows, columns=[*CELL, "runs", *columns, *differs])
 

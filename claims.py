@@ -28,6 +28,7 @@ from analysis import (
     projected_ranks,
     standardize,
     value_text,
+    weighted,
 )
 from colored_noise import autocovariance, mean_std
 from environments import COMPLEX, NAMES
@@ -275,9 +276,7 @@ def comparable_counts(runs, draws=300):
         for samples in cells.to_numpy():  # each beta's (n_envs, seeds)
             x = [s[rng.integers(len(s), size=(draws, len(s)))] for s in samples]
             x, w = np.hstack(x), np.repeat([1 / len(s) for s in samples], [len(s) for s in samples])
-            w = w / w.sum()
-            variance = (w * (x - (x @ w)[:, None]) ** 2).sum(1) / (1 - (w**2).sum())
-            sides.append([x @ w, variance**0.5, np.full(draws, 1 / (w**2).sum())])
+            sides.append(np.broadcast_arrays(*weighted(x, w)))
         sides = np.array(sides)  # (betas, 3, draws)
         leader = sides[sides[:, 0].argmax(0), :, np.arange(draws)].T
         for i, beta in enumerate(betas):

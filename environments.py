@@ -257,10 +257,10 @@ def unknown_id_message(env_id, name):
     return message
 
 
-def id_named(word, ids):
-    """The one of the ids that the word names, in full or short as cheetah-run; None if none is."""
+def ids_named(word, ids):
+    """Those of the ids that the word names, in full or short as cheetah-run."""
     pattern = rf"(dm_control/)?{re.escape(word)}(-v\d+)?"
-    return next((env_id for env_id in ids if re.fullmatch(pattern, env_id)), None)
+    return [env_id for env_id in ids if re.fullmatch(pattern, env_id)]
 
 
 def is_from_dm_control_suite(name):

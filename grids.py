@@ -51,7 +51,7 @@ import shlex
 import sys
 import textwrap
 
-from environments import COMPLEX, NAMES, id_named
+from environments import COMPLEX, NAMES, ids_named
 
 GRID = {  # a run for each combination, and what its words are where the preset says nothing else
     "seeds": [str(seed) for seed in range(1, 21)],
@@ -94,8 +94,8 @@ def words(parse):
 
 def full_id(word):
     """The id behind a short name such as cheetah-run, and any other id as it is."""
-    if env_id := id_named(word, NAMES):
-        return env_id
+    if known := ids_named(word, NAMES):
+        return known[0]
     if not re.search(r":|-v[0-9]+$", word):
         raise argparse.ArgumentTypeError(f"'{word}' is no environment")
     return matching("[A-Za-z0-9_./:-]+")(word)

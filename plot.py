@@ -69,10 +69,11 @@ STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 def look(beta):
     """Color and marker of a beta in all figures: sequential, color-blind-safe, dark enough."""
     place = np.interp(beta, STUDY_BETAS, range(len(STUDY_BETAS)))
-    return {
-        "color": plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1)),
-        "marker": "v^osDPX*"[round(place)],
-    }
+    studied, others = "v^osDPX*", "<>dp8+x"  # of another beta too, which may have no color
+    known = beta in STUDY_BETAS
+    marker = studied[round(place)] if known else others[round(10 * beta) % len(others)]
+    color = plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1))
+    return {"color": color, "marker": marker}
 
 
 def color(beta):
@@ -85,7 +86,7 @@ def extent(runs, of=None):
     text = f"{count} environment{'s'[: count > 1]}, n_envs {', '.join(map(str, n_envs))}"
     cells, left = runs.groupby(CELL).ngroups, 0 if of is None else len(of) - len(runs)
     text += f" ({cells} cells)" * (cells < count * len(n_envs)) + f", {len(runs)} runs"
-    return text + f"\n(without {left} runs that lack a counterpart)" * (left > 0)
+    return text + f"\n(without {left} runs that lack a counterpart or a second seed)" * (left > 0)
 
 
 def panels(count, xlabel="", ylabel="", width=2.5, height=1.9):
@@ -314,12 +315,14 @@ def n_envs_beta_grids(runs):
     """
     need(runs.beta.nunique() > 1, "at least two betas")
     grid, chosen = analysis.performance_grid(runs)
+    lengths = chosen.noise_seq_len.unique()
+    need(len(lengths) == 1, "one --noise-seq-len, of all environments: the projection goes by it")
     best = {"our": grid.idxmax()}
     if not analysis.differences(chosen).any():
         best["the paper's"] = (
             analysis.published("best_beta_per_n_envs").set_index("n_envs").best_beta
         )
-    axes_of_grid = (grid.index, grid.columns, int(chosen.noise_seq_len.iloc[0]))
+    axes_of_grid = (grid.index, grid.columns, int(lengths[0]))
     ranks = {"rank of performance within n_envs": -grid}
     for whose, betas in best.items():
         title = f"rank projected from the bias,\nby {whose} best $\\beta$"
@@ -417,7 +420,9 @@ def gsde_vs_beta(runs):
     need((runs.method == "gsde").any(), "runs of `baselines.py gsde`")
     need(runs.beta.notna().any(), "runs with colored noise to compare gSDE with")
     noise = runs.beta.fillna(np.inf)  # inf: gSDE
-    chosen = comparable(analysis.same_protocol(runs.assign(noise=noise)), ["noise"], CELL)
+    as_ppo = {*analysis.STUDY, "bootstrap_timeouts"} - {"method"}
+    runs = analysis.same_protocol(runs, sorted(as_ppo)).assign(noise=noise)
+    chosen = comparable(runs, ["noise"], CELL)
     chosen = chosen.assign(z=analysis.standardize(chosen))
     table = analysis.cells_intervals(chosen, "z", "noise", CELL)
     betas, gsde = table.drop(np.inf), table.loc[[np.inf]]
@@ -436,7 +441,7 @@ def complex_tasks(runs):
     """Sec. A8: performance per beta in each complex task."""
     runs = runs[runs.env_id.isin(COMPLEX)]
     need(len(runs), f"runs of {', '.join(COMPLEX)}")
-    chosen = comparable(runs, ["beta"], CELL)
+    chosen = pd.concat(comparable(x, ["beta"], ["n_envs"]) for _, x in runs.groupby("environment"))
     ylabel = "performance\n(mean, 95 % BCa interval)"
     fig, axes = panels(chosen.environment.nunique(), BETA, ylabel)
     for ax, (environment, group) in zip(axes, chosen.groupby("environment"), strict=True):
@@ -618,8 +623,10 @@ def make_all(todo, out):
     """
     made, not_made = {}, []
     for name, (make, data, *rest) in tqdm(todo.items(), desc="tables and figures", unit=""):
-        data = made.get(data, ()) if isinstance(data, str) else data
         try:
+            if isinstance(data, str):
+                need(data in made, f"the table {data}")
+                data = made[data]
             need(len(data), "runs with colored noise on tasks of the study")
             made[name] = make(data, *rest)
         except Unusable as error:
@@ -734,6 +741,7 @@ def draw_results(args):
     )
     methods, report["left out"] = analysis.select_methods(runs, args.method)
     runs = next(iter(methods.values()))
+    need(len(runs) or args.method == "ppo", f"a complete run of the method {args.method}")
     others = [f"{name}: {len(each)} runs" for name, each in methods.items() if each is not runs]
     report["of other methods, only where these are compared"] = others
     grid, dropped = analysis.main_grid(runs)

@@ -264,6 +264,9 @@ def test_final_return_tables(tmp_path, monkeypatch):
         *("Pendulum Swingup", 4, 7, "677.5 [677.5, 677.5]", "677.5", "694.7 [694.7, 694.7]"),
         *("694.6 (outside)", "403.1", "403.1", "3.0 [3.0, 3.0]", "733.1 (outside)"),
     ]
+    other = table.reset_index().replace({"beta": {"0": "10", "0.5": "-2", "1": "-1"}})
+    titles = " ".join(analysis.final_return_per_beta(other).filter(like="beta"))
+    assert titles == "beta -2 beta -1 beta 10 beta vanilla"
     summary = analysis.final_return_and_performance(runs[~runs.vanilla]).iloc[0]
     assert summary.final_return_mean == pytest.approx((677.54 + 694.66 + 403.1) / 3)
     assert summary.performance_max == pytest.approx(347.83)
@@ -549,6 +552,29 @@ def test_another_method_is_never_averaged_with_ppo(tmp_path):
     assert chosen.env_id.tolist() == [PENDULUM]
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_runs_of_another_script_are_never_averaged(tmp_path, packed):
+    """Nor does one of two runs of the same settings and seed count, in different experiments."""
+    for seed in (1, 2, 3):  # older runs do not name their script
+        folder = write_run(tmp_path / "runs", CAR, 0.5, 4, seed, [1.0], exp_name=f"part {seed}")
+        config = json.loads((folder / "config.json").read_text())
+        for name in ("ppo_colored_continuous.py", "my_ppo.py")[: seed - 1]:
+            config["script"] = {"name": name, "crc32": "0"}
+        (folder / "config.json").write_text(json.dumps(config))
+    path = tmp_path / "runs"
+    if packed:
+        analysis.pack(*analysis.load([path]), tmp_path / "packed.csv")
+        path = tmp_path / "packed.csv"
+    runs, _ = analysis.load([path])
+    assert len(analysis.select(runs[runs.script != "my_ppo.py"])[0]) == 2
+    with pytest.raises(analysis.Unusable, match="my_ppo.py and ppo_colored_continuous.py, which"):
+        analysis.select(runs)
+    twice = runs[:2].assign(seed=1)
+    with pytest.raises(analysis.Unusable, match="--exp-name part 1 and --exp-name part 2, which"):
+        analysis.select(twice)
+    assert len(analysis.select(twice.assign(exp_name="one"))[0]) == 1
+
+
 def test_main_grid_names_the_environments_that_it_drops(tmp_path):
     write_run(tmp_path, CAR, 0.5, 4, 1, [1.0])
     write_run(tmp_path, PENDULUM, 0.5, 2, 1, [1.0], n_steps=4096)
@@ -565,6 +591,11 @@ def test_main_grid_names_the_environments_that_it_drops(tmp_path):
         ({"total_timesteps": 20, "eval_freq": 5}, "--total-timesteps 20, --eval-freq 5"),
         ({"bootstrap_timeouts": True}, "--bootstrap-timeouts"),
         ({"noise_seq_len": 1024, "anneal_lr": True}, "--noise-seq-len 1024, --anneal-lr"),
+        ({"env_kwargs": {"a": 1}}, '--env-kwargs {"a": 1}'),
+        (
+            dict.fromkeys(["rescale_actions", "normalize_obs", "normalize_rewards"], True),
+            "--rescale-actions, --normalize-obs, --normalize-rewards",
+        ),
     ],
 )
 def test_no_published_numbers_beside_another_protocol(tmp_path, monkeypatch, other, flags):
@@ -696,7 +727,11 @@ def test_pack_does_not_overwrite(tmp_path, run):
         line = stderr.replace("\r", "\n").splitlines()[-1]
         assert (code, stdout) == (1, "") and line.startswith("error: ") and word in line
         assert (a.read_bytes(), b.read_bytes()) == before
-    write_run(tmp_path / "runs", PENDULUM, 1, 4, 2**53 + 1, [1.0])
+    write_run(tmp_path / "runs", PENDULUM, 1, 2, 2**53 + 1, [1.0])
+    filters = ["--beta", "1", "--n-envs", "4"]  # each is there, but no run has both
+    code, _, stderr = run("analysis.py pack", tmp_path / "runs", a, "--overwrite", *filters)
+    assert code == 1 and "error: needs runs that have all of --env" in stderr
+    assert a.read_bytes() == before[0]
     (write_run(tmp_path / "runs", PENDULUM, 1, 4, 7, [1.0]) / "config.json").write_text("")
     assert run("analysis.py pack", tmp_path / "runs", b, "--overwrite")[0] == 0
     runs, _ = analysis.load([b])
@@ -716,6 +751,9 @@ def test_a_filter_for_what_is_not_there_lists_what_is(tmp_path):
     ):
         with pytest.raises(analysis.Unusable, match=words):
             analysis.load([tmp_path], **filters)
+    for version in (4, 5):
+        write_run(tmp_path, f"HalfCheetah-v{version}", 0, 4, 1, [1.0])
+    assert len(analysis.load([tmp_path], env=["HalfCheetah"])[0]) == 2
 
 
 def test_linked_folders_are_read_once(tmp_path):
@@ -795,3 +833,9 @@ def test_other_methods_are_selected_apart(tmp_path, run):
     runs = pd.concat(methods.values())
     with pytest.raises(analysis.Unusable, match="gamma 0.9"):
         analysis.same_protocol(runs.assign(gamma=np.where(runs.method == "trpo", 0.9, 0.99)))
+    with pytest.raises(analysis.Unusable, match="--normalize-obs"):
+        analysis.same_protocol(runs.assign(normalize_obs=runs.method == "trpo"))
+    other = runs.assign(learning_rate=np.where(runs.method == "trpo", 1e-3, 2.5e-4))
+    analysis.same_protocol(other)
+    with pytest.raises(analysis.Unusable, match="--learning-rate"):
+        analysis.same_protocol(other, ["learning_rate"])

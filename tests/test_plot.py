@@ -89,7 +89,7 @@ def test_runs_that_cannot_be_used_are_listed(tmp_path, run):
     (folders[6] / "summary.json").unlink()
     (folders[6] / "evaluations.csv").unlink()
     (folders[7] / "evaluations.csv").write_text(header + "10,2,1,1\n")  # not what summary.json says
-    write_run(tmp_path, PENDULUM, 0.5, 4, 5, [2.0] * 4, exp_name="twice")
+    write_run(tmp_path / "again", PENDULUM, 0.5, 4, 5, [2.0] * 4)
     code, stdout, stderr = run("plot.py results", tmp_path, "--out", tmp_path / "figures")
     assert code == 0, stderr
     report = (tmp_path / "figures" / "report.txt").read_text()
@@ -278,6 +278,8 @@ def test_colors_get_lighter_with_beta_and_stay_dark_enough():
     gray = [np.dot(plot.color(beta)[:3], [0.299, 0.587, 0.114]) for beta in np.linspace(-1, 2, 50)]
     assert (np.diff(gray) > 0).all() and gray[-1] < 0.75
     assert len({plot.look(beta)["marker"] for beta in analysis.STUDY_BETAS}) == 8
+    others = [-2, -1, 0.2, 0.3, 0.4, 2, 2.5, 3, 4]
+    assert len({str(plot.look(beta)) for beta in others}) == len(others)
 
 
 @pytest.mark.parametrize("data", ["reproduction.csv", "study.csv", "bootstrapped_timeouts.csv"])
@@ -358,7 +360,8 @@ def test_averages_say_what_they_are_made_of(tmp_path):
     write_sweep(tmp_path, {0: 9, 0.5: 5}, n_envs=(4,), env_id=CAR)
     runs = select(tmp_path)
     fig = plot.compare(runs, "n_envs", ["environment", "beta"])
-    title = "1 environment, n_envs 4, 32, 20 runs\n(without 10 runs that lack a counterpart)"
+    title = "1 environment, n_envs 4, 32, 20 runs\n"
+    title += "(without 10 runs that lack a counterpart or a second seed)"
     assert fig.axes[0].get_title() == title
     fig = plot.compare(runs, "beta", ["environment", "n_envs"])
     assert fig.axes[0].get_title() == "2 environments, n_envs 4, 32 (3 cells), 30 runs"
@@ -372,6 +375,30 @@ def test_averages_say_what_they_are_made_of(tmp_path):
     z = runs.assign(z=analysis.standardize(runs)).groupby(["beta", "environment", "n_envs"]).z
     assert means == pytest.approx(z.mean().groupby("beta").mean().to_numpy())
     plt.close("all")
+
+
+def test_a_complex_task_with_one_seed_is_drawn_beside_one_with_two(tmp_path):
+    write_sweep(tmp_path, {0: 1, 0.5: 2}, seeds=2, env_id=PUSH)
+    write_sweep(tmp_path, {0: 1, 0.5: 2}, seeds=1, env_id="AntPush-v1")
+    fig = plot.complex_tasks(select(tmp_path))
+    assert [ax.get_title() for ax in fig.axes] == ["Ant Push", "Point Push"]
+    assert "without" not in fig.get_suptitle()
+    plt.close(fig)
+
+
+def test_figures_that_runs_do_not_allow_say_why(tmp_path, run):
+    """Short runs have no published numbers beside them; a projection goes by one T; no TRPO."""
+    for n_envs in (1, 4):
+        for env_id, T in ((CAR, 1000), (PENDULUM, 200)):
+            for beta in (0, 0.5):
+                write_run(tmp_path / "runs", env_id, beta, n_envs, 1, [1.0], noise_seq_len=T)
+    out = ["--out", tmp_path / "figures"]
+    assert run("plot.py results", tmp_path / "runs", *out)[0] == 0
+    report = (tmp_path / "figures" / "report.txt").read_text()
+    assert "beside_published: needs the table average_final_returns" in report
+    assert "n_envs_beta_grids: needs one --noise-seq-len" in report
+    code, _, stderr = run("plot.py results", tmp_path / "runs", "--method", "trpo", *out)
+    assert code == 1 and "error: needs a complete run of the method trpo" in stderr
 
 
 def test_grid_markers_stand_at_their_betas():
