@@ -174,10 +174,11 @@ class GSDEAgent(ppo.Agent):
         return logprobs, entropy, self.critic(obs).squeeze(-1)
 
 
-def gsde_exploration(agent, policy, noise, args):
+def gsde_exploration(agent, noise, args):
     """In place of ppo.exploration: a matrix W, (64, action_dim), per environment and rollout."""
     weights = torch.randn(args.n_envs, *agent.log_std.shape) * agent.log_std.exp().cpu()
-    weights, hidden = weights.numpy(), run_files.numpy_policy(agent.actor_mean[:-1])
+    weights, policy = weights.numpy(), run_files.numpy_policy(agent.actor_mean)
+    hidden = run_files.numpy_policy(agent.actor_mean[:-1])
     return lambda obs, t: policy(obs) + (hidden(obs)[:, None, :] @ weights)[:, 0]
 
 

@@ -16,8 +16,10 @@ import os
 import random
 import re
 import sys
+import sysconfig
 import tempfile
 import warnings
+import weakref
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -30,18 +32,27 @@ from gymnasium.wrappers.utils import RunningMeanStd
 
 
 def silence():
-    """Keeps the warnings and log lines of the packages used here off the terminal.
+    """Keeps the warnings and log lines of installed packages off the terminal, and those of ours.
 
-    For a program, not for a library.
+    Those of a user's environment are shown. For a program, not for a library.
     """
     global silent
     silent = True
     gym.logger.min_level = gym.logger.ERROR + 1
     logging.getLogger("absl").setLevel(logging.ERROR)
-    warnings.showwarning = lambda *args, **kwargs: None  # filters: some packages set their own
+    show, paths = warnings.showwarning, sysconfig.get_paths()
+    ours = [str(Path(__file__).with_name(f"{name}.py")) for name in OURS]
+    hidden = *ours, *(paths[kind] + os.sep for kind in ("stdlib", "purelib", "platlib"))
+
+    def show_others(message, category, filename, *args, **kwargs):
+        if not filename.startswith(("<", *hidden)):
+            show(message, category, filename, *args, **kwargs)
+
+    warnings.showwarning = show_others  # filters would not do: some packages set their own
 
 
 silent = False
+OURS = ["ppo_colored_continuous", "baselines", "play", "plot", "run_files", "environments", "mazes"]
 
 
 def silence_mujoco():
@@ -80,7 +91,7 @@ def preserved_generators():
 MAZE_IDS = ["PointUMaze-v1", "Point4Rooms-v1", "AntUMaze-v1", "Ant4Rooms-v1"]
 MAZE_IDS += ["SwimmerUMaze-v1", "Swimmer4Rooms-v1"]
 MAZE_IDS += ["PointPush-v1", "AntPush-v1", "PointPushMaze-v1", "AntPushMaze-v1"]
-for env_id in MAZE_IDS:  # Gymnasium's checks of every step would cost more than the point's physics
+for env_id in MAZE_IDS:  # without Gymnasium's checks of the first step: the tests know more
     robot, maze = re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id).groups()
     kwargs = {"robot": robot.lower(), "maze": maze}
     options = {"max_episode_steps": 1000, "reward_threshold": 0.9, "disable_env_checker": True}
@@ -172,6 +183,8 @@ def make_env(env_id, max_episode_steps=None, rescale_actions=False, env_kwargs=N
     those inside dm_control's locomotion and manipulation). With rescale_actions, actions in [-1, 1]
     stand for those between its bounds. env_kwargs: arguments of the environment, a dict.
 
+    This is the place for a wrapper of every environment. EnvPool's are not made here: --no-envpool.
+
     Raises gymnasium.error.Error with a message for the user: unknown id (naming close matches), a
     package that is missing, actions that are not continuous, observations without a fixed size.
     What a user's module or environment raises comes through with its traceback, a gymnasium.error
@@ -220,10 +233,14 @@ def make_env(env_id, max_episode_steps=None, rescale_actions=False, env_kwargs=N
             f"{env_id} has observations {observations}; the networks need a fixed number of values"
         )
     if rescale_actions:
-        if not actions.is_bounded():
+        if not can_be_rescaled(actions):
             raise gym.error.Error(f"--rescale-actions needs bounds, {env_id} has {actions}")
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     return FlatSpaces(env)
+
+
+def can_be_rescaled(actions):
+    return actions.is_bounded() and (actions.low < actions.high).all()
 
 
 def import_module_of(env_id, module):
@@ -307,11 +324,18 @@ def make_envs(args):
     envs = make_vector_env(args.env_id, args.n_envs, **options)
     eval_envs = make_vector_env(args.env_id, args.eval_episodes, **options)
     note_on_bounds(args.env_id, envs.single_action_space)
+    made = [env for env in (envs, eval_envs, video_env) if env is not None]
     envs = NormalizedVectorEnv(envs, args.normalize_obs, args.normalize_rewards, args.gamma)
+    weakref.finalize(envs, close, made)  # when a run has ended, in whatever way
     if args.normalize_obs:
         eval_envs = envs.frozen(eval_envs)
         video_env = video_env and envs.frozen_single(video_env)
     return envs, eval_envs, video_env, envs
+
+
+def close(envs):
+    for env in envs:
+        env.close()
 
 
 def note_on_bounds(env_id, space):
@@ -321,8 +345,9 @@ def note_on_bounds(env_id, space):
     far = np.isfinite(half) & ((half > 4) | (half < 0.25) | (abs(center) > half / 2))
     if far.any() and env_id not in NAMES:  # the paper's are as the paper had them
         low, high = (x[np.argmax(far)] for x in (space.low, space.high))
+        advice = ": --rescale-actions makes it [-1, 1]" if can_be_rescaled(space) else ""
         print(f"note: {env_id} has actions from {low:g} to {high:g}, and the policy begins with a "
-              "std of 1 around 0: --rescale-actions makes it [-1, 1]", file=sys.stderr)  # fmt: skip
+              f"std of 1 around 0{advice}", file=sys.stderr)  # fmt: skip
 
 
 class NormalizedVectorEnv(VectorWrapper):

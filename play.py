@@ -9,11 +9,11 @@ environment, also where the run had EnvPool's.
 """
 
 import argparse
+import atexit
 import contextlib
 import json
 import os
 import signal
-import sys
 import types
 from pathlib import Path
 
@@ -68,10 +68,9 @@ def read_run(folder, best=False):
         saved = torch.load(file, map_location="cpu", weights_only=True)
         acting = {"agent": saved["agent"], "normalization": saved.get("normalization", {})}
         acting["step"] = saved["step" if best else "global_step"]
-        ours, made_by = run_files.script(ppo.__file__), config.get("script")
-        if args["method"] == "ppo" and made_by and made_by["crc32"] != ours["crc32"]:
-            print(f"note: {made_by['name']} made this run, and is not the {ours['name']} here: "
-                  "with another network, this is another policy", file=sys.stderr)  # fmt: skip
+        if args["method"] == "ppo":
+            consequence = "with another network, this is another policy"
+            run_files.note_other_script(config, ppo.__file__, consequence)
         return types.SimpleNamespace(**args), acting
     except (FileNotFoundError, NotADirectoryError) as error:
         if best and (folder / "checkpoint.pt").exists():
@@ -135,6 +134,7 @@ def main(args):
     run_args, acting = read_run(args.run, args.best)
     with run_files.one_line_for(gym.error.Error):
         env = make_env(run_args, acting["normalization"], args)
+    atexit.register(env.close)
     with run_files.one_line_for(RuntimeError, because=f"the policy in {args.run} does not fit: "):
         policy = make_policy(acting, env, args, run_args)
     noise = f"noise of beta {' '.join(f'{b:g}' for b in args.beta)}" if args.beta else "no noise"

@@ -114,7 +114,7 @@ def layer_init(layer, gain=2**0.5):
 class Agent(nn.Module):
     """Separate actor and critic of 64-64 tanh units, and a log std that is the same in all states.
 
-    Any layers and parameters will do. actor_mean and log_std alone act; forward() is for learning.
+    Any layers but BatchNorm will do. actor_mean and log_std alone act; forward() is for learning.
     """
 
     def __init__(self, obs_dim, action_dim):
@@ -138,6 +138,7 @@ class Agent(nn.Module):
         """
         # The density of a single step. That eps is correlated over time does not enter: each eps is
         # still Gaussian by itself, and PPO's objective is made of single steps (docs/lesson.md).
+        # Mean and std are those of exploration(): what changes them here has to change them there.
         z = (actions - self.actor_mean(obs)) / self.log_std.exp()
         logprobs = (-0.5 * z**2 - self.log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
         entropy = (0.5 + 0.5 * math.log(2 * math.pi) + self.log_std).sum()
@@ -153,8 +154,9 @@ class Agent(nn.Module):
 # --- Collecting
 
 
-def exploration(agent, policy, noise, args):
+def exploration(agent, noise, args):
     """Returns act(obs (n_envs, obs_dim), t) -> actions (n_envs, action_dim), for one rollout."""
+    policy = run_files.numpy_policy(agent.actor_mean)
     std = agent.log_std.exp().cpu().numpy()
     shape = (args.n_steps, args.n_envs, len(std))
     # These lines are the paper: noise that is correlated over time, in place of white noise (Eq. 2)
@@ -297,8 +299,6 @@ def learn(agent, optimizer, batch, learning_rate, update, args):
                 params, optimizer, minibatch, learning_rate, agent, args
             )
             all_metrics.append(metrics)
-    if not params.isfinite().all():
-        fail("training diverged, the parameters are not finite: lower --learning-rate")
     nn.utils.vector_to_parameters(params, agent.parameters())
     means = {name: torch.stack([m[name] for m in all_metrics]).mean() for name in all_metrics[0]}
     return optimizer, means
@@ -326,7 +326,7 @@ def evaluate(policy, envs, seeds, max_steps=10_000):
         running &= ~(terminated | truncated)
         if not running.any():
             return returns, lengths
-    fail(f"no end of an episode after {max_steps} steps: --max-episode-steps N sets a time limit")
+    fail(f"no end of an episode after {max_steps} steps: --max-episode-steps N sets the limit")
 
 
 # --- The whole run
@@ -399,10 +399,11 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
                 break
 
             # Collect a batch, and learn from it
-            act = exploration(agent, policy, noise, args)
+            act = exploration(agent, noise, args)
             batch, ended = collect(agent, act, envs, storage, running, args, bar)
             learning_rate = args.learning_rate * (1 - global_step / total if args.anneal_lr else 1)
             optimizer, metrics = learn(agent, optimizer, batch, learning_rate, update, args)
+            run_files.check_learned(agent)
             global_step += steps_per_update
 
             # Write it down

@@ -241,6 +241,12 @@ def check_finite(args, step, **arrays):
                  f"step {step}: not finite, so nothing can be learned from it")  # fmt: skip
 
 
+def check_learned(agent):
+    """Ends the program where a parameter has become NaN or infinite."""
+    if not all(parameter.isfinite().all() for parameter in agent.parameters()):
+        fail("training diverged, the parameters are not finite: lower --learning-rate")
+
+
 @contextlib.contextmanager
 def one_line_for(*errors, because=""):
     """Ends the program with one line, and no traceback, where one of these errors comes up."""
@@ -254,26 +260,29 @@ def learnable(agent):
     """The module `agent`, ready to be learned as one flat vector, without autograd.
 
     Ends the program for what that would get wrong in silence: a parameter that is to stay as it is,
-    and one that belongs to two modules. A module in two places is one module.
+    and one that has two names. A module in two places is one module.
     """
     names = {}
     for prefix, module in agent.named_modules():
-        for name, parameter in module.named_parameters(prefix, recurse=False):
+        for name, parameter in module.named_parameters(
+            prefix, recurse=False, remove_duplicate=False
+        ):
             if not parameter.requires_grad:
                 fail(f"{name} has requires_grad=False and would be learned all the same: "
                      "register_buffer keeps a value as it is")  # fmt: skip
             if id(parameter) in names:
-                fail(f"{name} and {names[id(parameter)]} are one parameter in two modules: use one "
-                     "module in both places")  # fmt: skip
+                fail(f"{name} and {names[id(parameter)]} are one parameter: give it one name, or "
+                     "use one module in both places")  # fmt: skip
             names[id(parameter)] = name
     return agent.requires_grad_(False)
 
 
 def refilled(fresh, saved):
-    """The tensors `saved`, on the devices of the fresh ones. ValueError where shapes differ."""
-    if [x.shape for x in fresh] != [x.shape for x in saved]:
+    """What was saved, tensors on the devices of the fresh ones. ValueError where shapes differ."""
+    if list(map(np.shape, fresh)) != list(map(np.shape, saved)):
         raise ValueError("the optimizer's tensors have other shapes")
-    return tuple(y.to(x.device) for x, y in zip(fresh, saved, strict=True))
+    pairs = zip(fresh, saved, strict=True)
+    return tuple(y.to(x.device) if torch.is_tensor(x) else y for x, y in pairs)
 
 
 def numpy_policy(actor):
@@ -284,14 +293,17 @@ def numpy_policy(actor):
     in eval mode. The weights are copied: make it anew when the module has learned.
     """
     activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0), nn.Identity: lambda x: x}
-    layers = actor if type(actor) is nn.Sequential else [actor]
+
+    def has_hooks(module):
+        return module._forward_hooks or module._forward_pre_hooks
+
+    whole = type(actor) is not nn.Sequential or has_hooks(actor)
     functions = []
-    for layer in layers:
-        hooks = layer._forward_hooks or layer._forward_pre_hooks
-        if type(layer) is nn.Linear and layer.bias is not None and not hooks:
+    for layer in [actor] if whole else actor:
+        if type(layer) is nn.Linear and layer.bias is not None and not has_hooks(layer):
             weight, bias = (p.detach().cpu().numpy().T.copy() for p in (layer.weight, layer.bias))
             functions.append(lambda x, weight=weight, bias=bias: x @ weight + bias)
-        elif type(layer) in activations and not hooks:
+        elif type(layer) in activations and not has_hooks(layer):
             functions.append(activations[type(layer)])
         else:
             device, module = next(actor.parameters()).device, copy.deepcopy(actor).eval()
@@ -394,6 +406,10 @@ class RunFolder:
                  "--overwrite to start again")  # fmt: skip
         elif (self.path / "checkpoint.pt").exists():
             self.checkpoint = self._read_checkpoint()
+        if self.summary or self.checkpoint:
+            consequence = "this one goes on" if self.checkpoint else "--overwrite runs it again"
+            config = self._read_json("config.json", "args", dict)
+            note_other_script(config, sys.argv[0], consequence)
 
     def start(self, step, **resolved):
         """Makes the folder ready to go on from this step: cut back to the checkpoint, or cleared.
@@ -408,6 +424,7 @@ class RunFolder:
                 (self.path / "summary.json").unlink(missing_ok=True)  # of a run trained longer
                 config = self._read_json("config.json", "args", dict)
                 config["args"]["total_timesteps"] = self._args["total_timesteps"]
+                config["script"] = script(sys.argv[0])
                 self._write_json("config.json", config)
                 self._cut_back(self.checkpoint["file_sizes"])
                 self._best = self.checkpoint.get("best")
@@ -664,6 +681,17 @@ def script(path):
     """Name and checksum of a script, as config.json has those of the one that made the run."""
     with contextlib.suppress(OSError):
         return {"name": Path(path).name, "crc32": f"{zlib.crc32(Path(path).read_bytes()):08x}"}
+
+
+def note_other_script(config, path, consequence):
+    """Prints a line where another script than the one at `path` made the run of this config.json.
+
+    Another version of it is another script.
+    """
+    ours, made_by = script(path), config.get("script")
+    if ours and isinstance(made_by, dict) and made_by.get("crc32") != ours["crc32"]:
+        which = f"{made_by.get('name')} made this run, and is not the {ours['name']} here"
+        print(f"note: {which}: {consequence}", file=sys.stderr)
 
 
 def _git_commit():

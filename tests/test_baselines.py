@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, run_forked
+from conftest import ROOT, TINY, run_forked
 from sb3_contrib import TRPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -162,10 +162,10 @@ def test_gsde_noise():
     policy = run_files.numpy_policy(agent.actor_mean)
     torch.manual_seed(0)
     obs = np.tile(np.float32([[0.3, -1, 2]]), (20000, 1))
-    act = baselines.gsde_exploration(agent, policy, None, args)
+    act = baselines.gsde_exploration(agent, None, args)
     noise = act(obs, 0) - policy(obs)
     assert np.array_equal(act(obs, 7) - policy(obs), noise)  # the same in the whole rollout
-    other = baselines.gsde_exploration(agent, policy, None, args)(obs, 0) - policy(obs)
+    other = baselines.gsde_exploration(agent, None, args)(obs, 0) - policy(obs)
     for a, b in [
         (noise[:, 0], other[:, 0]),
         (noise[:-1, 0], noise[1:, 0]),
@@ -211,6 +211,14 @@ def test_kill_and_resume(tmp_path, method):
     optimizer = torch.load(folder / "checkpoint.pt", weights_only=True)["optimizer"]
     updates = 8192 / 128
     assert optimizer[2] == updates * {"a2c": 1, "trpo": 10, "gsde": 10}[method]
+
+
+def test_a_diverged_a2c_is_called_so(tmp_path):
+    flags = TINY.replace("--n-epochs 1", f"--env-id Pendulum-v1 --runs-dir {tmp_path}")
+    flags = f"a2c --learning-rate 1e38 {flags}"
+    process = run_forked(ROOT / "baselines.py", flags.split(), tmp_path, 60)
+    assert process.returncode == 1
+    assert process.stderr.splitlines()[-1].startswith("error: training diverged")
 
 
 @pytest.mark.parametrize(

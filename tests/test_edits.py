@@ -140,11 +140,49 @@ def test_a_trunk_that_actor_and_critic_share(tmp_path, original, flags):
     assert (fresh - 2**0.5).abs().max() > 1e-3 and np.isfinite(scalars["losses/value_loss"]).all()
 
 
-def test_one_parameter_in_two_modules_is_refused(tmp_path, capsys):
-    tied = f"{CRITIC}\n        self.critic[0].weight = self.actor_mean[0].weight"
+@pytest.mark.parametrize(
+    "line, alias",
+    [(CRITIC, "self.critic[0].weight = self.actor_mean[0].weight")]
+    + [(LOG_STD, "self.scale = self.log_std")],
+)
+def test_one_parameter_with_two_names_is_refused(tmp_path, capsys, line, alias):
     with pytest.raises(SystemExit):
-        run(edit(tmp_path, (CRITIC, tied)), tmp_path)
-    assert "are one parameter in two modules" in capsys.readouterr().err
+        run(edit(tmp_path, (line, f"{line}\n        {alias}")), tmp_path)
+    assert "are one parameter: give it one name" in capsys.readouterr().err
+
+
+def test_a_hook_acts():
+    actor = torch.nn.Sequential(torch.nn.Linear(3, 1)).requires_grad_(False)
+    actor.register_forward_hook(lambda module, inputs, output: 0 * output + 1.5)
+    assert run_files.numpy_policy(actor)(np.ones((1, 3), np.float32)) == 1.5
+
+
+def test_an_agent_changed_in_the_loop_acts(tmp_path):
+    """Its mean and its std: the actions are those that the log-probabilities are of."""
+    line = "            act = exploration(agent, noise, args)"
+    changed = "            agent.actor_mean[-1].bias += 1.7\n            agent.log_std -= 9\n"
+    batches = []
+
+    def learn(agent, optimizer, batch, *_):
+        batches.append((batch[1].clone(), agent.actor_mean(batch[0])))
+        return optimizer, {}
+
+    run(edit(tmp_path, (line, changed + line)), tmp_path, learn=learn)
+    for i, (actions, means) in enumerate(batches):
+        assert means.mean() > 1.5 * (i + 1)
+        torch.testing.assert_close(actions, means, atol=1e-3, rtol=0)
+
+
+def test_another_optimizers_state_is_resumed(tmp_path):
+    """With a plain number in it, say."""
+    step = "step = torch.zeros((), dtype=torch.float64, device=args.device)"
+    module = edit(tmp_path, (step, "step = 0"))
+    run(module, tmp_path)
+    (folder,) = (path.parent for path in tmp_path.rglob("summary.json"))
+    (folder / "summary.json").unlink()
+    flags = FLAGS.replace("--overwrite", f"--resume --no-compile --runs-dir {tmp_path / 'runs'}")
+    module.main(module.parse_args(flags.split()))
+    assert (folder / "summary.json").exists()
 
 
 def test_dropout_is_off_in_the_policy():

@@ -172,6 +172,12 @@ def test_rescaled_actions():
         make_env("Scaled-v0", rescale_actions=True, env_kwargs={"high": float("inf")})
 
 
+def test_an_action_without_a_choice_cannot_be_rescaled():
+    """It would be NaN."""
+    with pytest.raises(gym.error.Error, match="--rescale-actions needs bounds"):
+        make_env("Scaled-v0", rescale_actions=True, env_kwargs={"low": 1, "high": 1})
+
+
 @pytest.mark.parametrize("env_id", environments.ENVPOOL_TASKS)
 def test_envpool_has_nothing_to_rescale(env_id):
     space = make_vector_env(env_id, 1, envpool=True, rescale_actions=True).single_action_space
@@ -187,6 +193,9 @@ def test_notice_on_bounds(capsys, low, high, noticed):
     space = gym.spaces.Box(np.float32(low), np.float32(high), (2,))
     environments.note_on_bounds("Scaled-v0", space)
     assert ("--rescale-actions" in capsys.readouterr().err) == noticed
+    half = gym.spaces.Box(np.float32([0, 0]), np.float32([1000, np.inf]))
+    environments.note_on_bounds("Scaled-v0", half)  # what would be refused is not advised
+    assert "--rescale" not in capsys.readouterr().err
     environments.note_on_bounds("AntUMaze-v1", space)  # the paper's are as the paper had them
     assert capsys.readouterr().err == ""
 

@@ -22,7 +22,6 @@ import plot
 import ppo_colored_continuous as ppo
 from colored_noise import ColoredNoiseProcess
 from environments import NAMES
-from run_files import numpy_policy
 
 NOISE = {"noise_random_walks", "noise_psd", "noise_two_step", "noise_marginal", "noise_bias"}
 TABLES = {
@@ -571,7 +570,7 @@ def test_untrained_cars_are_those_of_a_first_rollout():
     agent = ppo.Agent(2, 1).requires_grad_(False)
     args = argparse.Namespace(n_steps=200, n_envs=3, vanilla=False)
     noise = ColoredNoiseProcess(0.5, 3, 1, seed=4)
-    act = ppo.exploration(agent, numpy_policy(agent.actor_mean), noise, args)
+    act = ppo.exploration(agent, noise, args)
     envs = [gym.make("MountainCarContinuous-v0") for _ in range(3)]
     obs = np.array([env.reset(seed=4 + i)[0] for i, env in enumerate(envs)])
     for t in range(200):

@@ -272,6 +272,21 @@ def test_a_finished_run_is_not_run_again(train, tiny, tmp_path):
     assert_complete_tiny_run(only_run(tmp_path))
 
 
+def test_a_run_of_another_script_is_not_gone_on_with_in_silence(train, tiny, tmp_path):
+    """Nor is it taken for one of this script, as sweeps and whoever has edited it might do."""
+    assert train(tiny).returncode == 0
+    config = only_run(tmp_path) / "config.json"
+    ours = json.loads(config.read_text())["script"]
+    config.write_text(config.read_text().replace(ours["crc32"], "an earlier one"))
+    note = f"note: {ours['name']} made this run, and is not the {ours['name']} here: "
+    assert train(tiny).stderr == f"{note}--overwrite runs it again\n"
+    longer = tiny.replace("--total-timesteps 4096", "--total-timesteps 8192")
+    process = train(f"{longer} --resume")
+    assert process.returncode == 0 and process.stderr.startswith(f"{note}this one goes on\n")
+    assert json.loads(config.read_text())["script"] == ours
+    assert train(longer).stderr == ""
+
+
 def test_an_unfinished_run_is_not_overwritten_unasked(train, tiny, tmp_path):
     process = start(tmp_path, tiny)
     wait_for_rows(tmp_path, 2, process)
@@ -422,7 +437,7 @@ def test_help_is_complete():
 # ---- Nothing lost, nothing misleading
 
 MY_ENV = '''
-import os, random, signal, time
+import os, random, signal, time, warnings
 import gymnasium as gym, numpy as np
 
 class Mine(gym.Env):
@@ -439,6 +454,8 @@ class Mine(gym.Env):
 
     def reset(self, seed=None, options=None):
         self.t, self.episodes = 0, self.episodes + 1
+        if self.what == "warns":
+            warnings.warn("not calibrated")
         return np.float32([random.random() + np.random.random()]), {}
 
     def step(self, action):
@@ -465,7 +482,11 @@ class Mine(gym.Env):
                 time.sleep(60)
         return x, reward, False, self.t == 50 and self.what != "endless", {}
 
-for what in ["observation", "reward", "OSError", "gym", "signal", "hang", "endless", "well"]:
+    def close(self):
+        with open(os.path.join(os.path.dirname(__file__), "closed"), "a") as file:
+            file.write(self.what + " ")
+
+for what in "observation reward OSError gym signal hang endless well warns".split():
     gym.register(f"Mine-{what}-v0", Mine, kwargs={"what": what})
 '''
 
@@ -513,6 +534,14 @@ def test_a_deleted_tensorboard_file_is_a_note(train, tiny, tmp_path):
     assert process.returncode == 0 and "note: events.out" in process.stderr
     steps = [row["step"] for row in read_evaluations(only_run(tmp_path))]
     assert steps == list(range(512, 4097, 512))
+
+
+@pytest.mark.parametrize("beta, words", [("0", "not calibrated"), ("0 1", "--beta has 2 values")])
+def test_environments_are_closed_and_their_warnings_shown(tiny, tmp_path, mine, beta, words):
+    """Whatever has ended the program: a simulator may be a process that would go on."""
+    process = start(tmp_path, f"{tiny} --env-id mine_env:Mine-warns-v0 --beta {beta}")
+    assert words in process.communicate()[1]
+    assert (tmp_path / "closed").read_text().split() == ["warns"] * 4
 
 
 def test_no_time_limit(train, tiny, tmp_path, mine):
