@@ -69,9 +69,10 @@ STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 def look(beta):
     """Color and marker of a beta in all figures: sequential, color-blind-safe, dark enough."""
     place = np.interp(beta, STUDY_BETAS, range(len(STUDY_BETAS)))
-    studied, others = "v^osDPX*", "<>dp8+x"  # of another beta too, which may have no color
-    known = beta in STUDY_BETAS
-    marker = studied[round(place)] if known else others[round(10 * beta) % len(others)]
+    if beta in STUDY_BETAS:
+        marker = "v^osDPX*"[round(place)]
+    else:  # told apart by it, since the color may be that of a neighbor
+        marker = "<>dp8+x"[round(10 * beta) % 7]
     color = plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1))
     return {"color": color, "marker": marker}
 

@@ -243,7 +243,7 @@ def check_finite(args, step, **arrays):
 
 def check_learned(agent):
     """Ends the program where a parameter has become NaN or infinite."""
-    if not all(parameter.isfinite().all() for parameter in agent.parameters()):
+    if not nn.utils.parameters_to_vector(agent.parameters()).isfinite().all():
         fail("training diverged, the parameters are not finite: lower --learning-rate")
 
 
