@@ -69,10 +69,8 @@ STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 def look(beta):
     """Color and marker of a beta in all figures: sequential, color-blind-safe, dark enough."""
     place = np.interp(beta, STUDY_BETAS, range(len(STUDY_BETAS)))
-    if beta in STUDY_BETAS:
-        marker = "v^osDPX*"[round(place)]
-    else:  # told apart by it, since the color may be that of a neighbor
-        marker = "<>dp8+x"[round(10 * beta) % 7]
+    other = "<>dp8+x"[round(10 * beta) % 7]  # of no beta of the study; the color may be a neighbor's
+    marker = "v^osDPX*"[round(place)] if beta in STUDY_BETAS else other
     color = plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1))
     return {"color": color, "marker": marker}
 
