@@ -69,7 +69,7 @@ STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 def look(beta):
     """Color and marker of a beta in all figures: sequential, color-blind-safe, dark enough."""
     place = np.interp(beta, STUDY_BETAS, range(len(STUDY_BETAS)))
-    other = "<>dp8+x"[round(10 * beta) % 7]  # of no beta of the study; the color may be a neighbor's
+    other = "<>dp8+x"[round(10 * beta) % 7]  # its color may be another beta's
     marker = "v^osDPX*"[round(place)] if beta in STUDY_BETAS else other
     color = plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1))
     return {"color": color, "marker": marker}
