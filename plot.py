@@ -444,8 +444,11 @@ def complex_tasks(runs):
     ylabel = "performance\n(mean, 95 % BCa interval)"
     fig, axes = panels(chosen.environment.nunique(), BETA, ylabel)
     for ax, (environment, group) in zip(axes, chosen.groupby("environment"), strict=True):
-        draw_betas(ax, analysis.cells_intervals(group, "performance", "beta", ["n_envs"]))
-        ax.set(title=environment, xticks=[-1, 0, 1, 2], xticklabels=["-1", "0", "1", "2"])
+        table = analysis.cells_intervals(group, "performance", "beta", ["n_envs"])
+        draw_betas(ax, table)
+        no_interval = "\n(one run each: no interval)" * bool(table.low.isna().any())
+        ax.set_title(environment + no_interval)
+        ax.set(xticks=[-1, 0, 1, 2], xticklabels=["-1", "0", "1", "2"])
     fig.suptitle(extent(chosen, runs), fontsize=9)
     return fig
 

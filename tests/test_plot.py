@@ -380,7 +380,10 @@ def test_a_complex_task_with_one_seed_is_drawn_beside_one_with_two(tmp_path):
     write_sweep(tmp_path, {0: 1, 0.5: 2}, seeds=2, env_id=PUSH)
     write_sweep(tmp_path, {0: 1, 0.5: 2}, seeds=1, env_id="AntPush-v1")
     fig = plot.complex_tasks(select(tmp_path))
-    assert [ax.get_title() for ax in fig.axes] == ["Ant Push", "Point Push"]
+    assert [ax.get_title() for ax in fig.axes] == [
+        "Ant Push\n(one run each: no interval)",
+        "Point Push",
+    ]
     assert "without" not in fig.get_suptitle()
     plt.close(fig)
 
