@@ -138,7 +138,7 @@ def read_run(folder):
         known = {"env_id": str(args["env_id"]), "beta": betas_text(beta)}
         expected = int(args["total_timesteps"]) // int(args["eval_freq"])
         run = {**args, **whole, **known, "git_commit": config["git_commit"]}
-        run["script"] = config.get("script", {}).get("name")
+        run["script"] = (config.get("script") or {}).get("name")
         if args.get("env_kwargs") is not None:
             run["env_kwargs"] = json.dumps(args["env_kwargs"], sort_keys=True)
         rows = (folder / "evaluations.csv").read_text().splitlines()[1:]

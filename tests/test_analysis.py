@@ -555,18 +555,19 @@ def test_another_method_is_never_averaged_with_ppo(tmp_path):
 @pytest.mark.parametrize("packed", [False, True])
 def test_runs_of_another_script_are_never_averaged(tmp_path, packed):
     """Nor does one of two runs of the same settings and seed count, in different experiments."""
-    for seed in (1, 2, 3):  # older runs do not name their script
+    scripts = [{}, {"script": None}]  # older runs do not name it, nor those of `python -c`
+    for name in ("ppo_colored_continuous.py", "my_ppo.py"):
+        scripts.append({"script": {"name": name, "crc32": "0"}})
+    for seed, script in enumerate(scripts, start=1):
         folder = write_run(tmp_path / "runs", CAR, 0.5, 4, seed, [1.0], exp_name=f"part {seed}")
         config = json.loads((folder / "config.json").read_text())
-        for name in ("ppo_colored_continuous.py", "my_ppo.py")[: seed - 1]:
-            config["script"] = {"name": name, "crc32": "0"}
-        (folder / "config.json").write_text(json.dumps(config))
+        (folder / "config.json").write_text(json.dumps(config | script))
     path = tmp_path / "runs"
     if packed:
         analysis.pack(*analysis.load([path]), tmp_path / "packed.csv")
         path = tmp_path / "packed.csv"
     runs, _ = analysis.load([path])
-    assert len(analysis.select(runs[runs.script != "my_ppo.py"])[0]) == 2
+    assert len(analysis.select(runs[runs.script != "my_ppo.py"])[0]) == 3
     with pytest.raises(analysis.Unusable, match="my_ppo.py and ppo_colored_continuous.py, which"):
         analysis.select(runs)
     twice = runs[:2].assign(seed=1)
