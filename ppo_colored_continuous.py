@@ -7,8 +7,7 @@ Everything else is PPO as Stable-Baselines3 has it.
 
     python ppo_colored_continuous.py --env-id MountainCarContinuous-v0 --beta 0.5
 
-To change the method, edit this file. main() at its end reads as the method does: evaluate where it
-is due, collect a batch, learn from it, write it down.
+To change the method, edit this file. main() at its end reads as the method does.
 """
 
 import argparse
@@ -380,10 +379,11 @@ def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=pp
     with run, run_files.progress_bar(total, global_step) as bar:
         while True:
             # Evaluate at every multiple of eval_freq at which this policy is the one that acts
-            policy, returns = run_files.numpy_policy(agent.actor_mean), None
+            returns = None
             acting = {"agent": agent.state_dict(), "normalization": normalization.state_dict()}
             while next_eval <= min(global_step + steps_per_update - 1, args.total_timesteps):
                 if returns is None or not args.eval_once_per_policy:
+                    policy = run_files.numpy_policy(agent.actor_mean)
                     seeds = make_seeds(args.eval_episodes, args.seed, 2, next_eval)
                     returns, lengths = evaluate(policy, eval_envs, seeds, limit)
                 run.add_evaluation(next_eval, returns, lengths, acting)

@@ -398,7 +398,8 @@ class RunFolder:
                     fail(f"{self.path} has {name} but no config.json: restore it, or start again "
                          "with --overwrite")  # fmt: skip
             return
-        longer = self._check_same_run()
+        config = self._read_json("config.json", "args", dict)
+        longer = self._check_same_run(config["args"])
         if (self.path / "summary.json").exists() and not longer:
             self.summary = self._read_json("summary.json", "final_return", float)
         elif not args["resume"]:
@@ -408,7 +409,6 @@ class RunFolder:
             self.checkpoint = self._read_checkpoint()
         if self.summary or self.checkpoint:
             consequence = "this one goes on" if self.checkpoint else "--overwrite runs it again"
-            config = self._read_json("config.json", "args", dict)
             note_other_script(config, sys.argv[0], consequence)
 
     def start(self, step, **resolved):
@@ -566,12 +566,12 @@ class RunFolder:
         shutil.rmtree(self.path / "videos", ignore_errors=True)
         self._sizes = {}
 
-    def _check_same_run(self):
-        """Refuses to mix runs: what decides the result must be the same as in config.json.
+    def _check_same_run(self, recorded):
+        """Refuses to mix runs: what decides the result must be as in the arguments recorded.
 
         Returns whether this is the same run, but longer.
         """
-        old = ABSENT | self._read_json("config.json", "args", dict)["args"]
+        old = ABSENT | recorded
         args = json.loads(json.dumps(self._args))
         total, old_total = args["total_timesteps"], old.get("total_timesteps")
         could_be = isinstance(old_total, int) and total > old_total
