@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT
+from scipy import stats
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 
@@ -251,6 +252,29 @@ def test_new_seeds_are_those_of_the_data(file, varies):
     for values in thirty:  # white noise in pendulum
         mean, low, high = mean_interval(values)
         assert f"at {mean:.0f} [{low:.0f}, {high:.0f}] (published" in text
+
+
+def test_the_comparisons_of_new_seeds_are_those_of_the_data():
+    text = section((ROOT / "results" / "README.md").read_text(), "Where the numbers differ")
+    runs, _ = load([ROOT / "results" / "new_seeds.csv"])
+    runs = runs[(runs.env_id == "dm_control/pendulum-swingup-v0") & (runs.status == "complete")]
+    runs = runs.assign(default=runs.bootstrap_timeouts.astype(bool))
+
+    def p(a, b, column="final_return"):
+        return f"p = {stats.mannwhitneyu(a[column], b[column]).pvalue:.2f}"
+
+    small, default, usual = {}, {}, {}
+    for n_envs, group in runs.groupby("n_envs"):
+        small[n_envs] = group[group.batch_size == 64]
+        default[n_envs] = group[group.default]
+        usual[n_envs] = group[(group.batch_size == 128) & ~group.default]
+    means = [f"{x[1].performance.mean():.0f}" for x in (small, usual)]
+    sooner = p(small[1], usual[1], "performance")
+    assert f"(performance {means[0]}, these {means[1]}; Mann-Whitney, {sooner})" in text
+    assert f"end where these do ({p(small[1], usual[1])})" in text
+    assert f"does worse ({p(default[1], usual[1])})" in text
+    same_seeds = usual[4][usual[4].seed.isin(small[4].seed)]
+    assert f"n_envs 4: Mann-Whitney, {p(small[4], same_seeds)})" in text
 
 
 def test_the_table_of_agreement_is_the_data(measured):
