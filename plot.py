@@ -1,4 +1,4 @@
-"""Every figure of the study; its tables, from analysis.py, with the published numbers beside ours.
+"""Every figure of the study. Its tables (study/tables.py) show the published numbers beside ours.
 
     python plot.py noise           what the noise looks like: nothing needs to be trained
     python plot.py results runs/   figures and tables of all complete runs, in folders or packed
@@ -12,37 +12,27 @@ with its appendix.
 
 import argparse
 import math
+import re
 from pathlib import Path
 
-import gymnasium as gym
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import torch
 from matplotlib.animation import FuncAnimation, PillowWriter
-from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
 from tqdm import tqdm
 
-import analysis
-import claims
-from analysis import CELL, STUDY_BETAS, Unusable, beta_text, comparable, need
-from colored_noise import (
-    ColoredNoiseProcess,
-    autocovariance,
-    colored_noise,
-    expected_psd,
-    marginal_variance,
-    mean_std,
-)
-from environments import COMPLEX, NAMES, make_render_env, make_vector_env, silence
-from ppo_colored_continuous import Agent
-from run_files import fail, numpy_policy
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import ppo_colored_continuous as ppo
+import study.runs
+from colored_noise import autocovariance, colored_noise, expected_psd, marginal_variance, mean_std
+from study import claims, tables
+from study.environments import prepare_rendering
+from study.protocol import BETAS, COMPLEX, NAMES, SETTINGS
+from study.runs import CELL, Unusable, comparable, differences, need, published, same_protocol
+from study.statistics import cells_intervals, mean_interval, mean_intervals, standardize
 
 # --- Drawing --------------------------------------------------------------------------------------
 
@@ -57,8 +47,8 @@ plt.rc("pdf", fonttype=42)  # TrueType: journals refuse Type 3 fonts
 INK = "0.25"  # what is not about one beta
 BETA = r"noise color $\beta$"
 BETA_NAMED = f"{BETA} (-1 blue, 0 white, 1 pink, 2 red)"
-METHOD_NAMES = {"ppo": "PPO", "trpo": "TRPO", "a2c": "A2C"}
-METHOD_LOOK = {  # Okabe and Ito's colors, told apart by all
+PAPER = {"ls": ":", "lw": 0.9, "mfc": "none"}  # the published numbers: open markers
+METHOD_LOOK = {  # Okabe and Ito's colors, which color-blind readers can tell apart
     "ppo": {"color": "#0072B2", "marker": "o"},
     "trpo": {"color": "#D55E00", "marker": "s", "ls": "--"},
     "a2c": {"color": "#000000", "marker": "^", "ls": ":"},
@@ -67,37 +57,35 @@ STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
 
 
 def look(beta):
-    """Color and marker of a beta in all figures: sequential, color-blind-safe, dark enough."""
-    place = np.interp(beta, STUDY_BETAS, range(len(STUDY_BETAS)))
-    other = "<>dp8+x"[round(10 * beta) % 7]  # its color may be another beta's
-    marker = "v^osDPX*"[round(place)] if beta in STUDY_BETAS else other
-    color = plt.get_cmap("plasma")(0.82 * place / (len(STUDY_BETAS) - 1))
-    return {"color": color, "marker": marker}
+    """Color and marker of a beta in all figures: the lighter, the larger beta is."""
+    place = np.interp(beta, BETAS, range(len(BETAS)))
+    marker = "v^osDPX*"[round(place)] if beta in BETAS else "<>dp8+x"[round(10 * beta) % 7]
+    return {"color": plt.get_cmap("plasma")(0.82 * place / (len(BETAS) - 1)), "marker": marker}
 
 
 def color(beta):
     return look(beta)["color"]
 
 
+def environments(count):
+    return f"{count} environment{'s'[: count > 1]}"
+
+
 def extent(runs, of=None):
     """What a figure is made of, for its title; `of`: the runs that they were chosen from."""
     n_envs, count = sorted(runs.n_envs.unique()), runs.environment.nunique()
-    text = f"{count} environment{'s'[: count > 1]}, n_envs {', '.join(map(str, n_envs))}"
+    text = f"{environments(count)}, n_envs {', '.join(map(str, n_envs))}"
     cells, left = runs.groupby(CELL).ngroups, 0 if of is None else len(of) - len(runs)
     text += f" ({cells} cells)" * (cells < count * len(n_envs)) + f", {len(runs)} runs"
     return text + f"\n(without {left} runs that lack a counterpart or a second seed)" * (left > 0)
 
 
 def panels(count, xlabel="", ylabel="", width=2.5, height=1.9):
-    """A figure with `count` axes in even rows of at most four, labelled at its left and below.
-
-    Returns the figure and the list of axes.
-    """
+    """A figure with a list of `count` axes, at most four in a row, labelled left and below."""
     rows = math.ceil(count / 4)
     columns = math.ceil(count / rows)
-    fig, axes = plt.subplots(
-        rows, columns, figsize=(max(width * columns, 5), height * rows + 0.5), squeeze=False
-    )
+    size = max(width * columns, 5), height * rows + 0.5
+    fig, axes = plt.subplots(rows, columns, figsize=size, squeeze=False)
     for ax in axes.flat[count:]:
         ax.remove()
     axes = list(axes.flat[:count])
@@ -114,6 +102,13 @@ def legend_above(fig, *entries, betas=()):
     handles += [Line2D([], [], **{"color": INK, **style}, label=label) for label, style in entries]
     rows = -(-len(handles) // int(fig.get_figwidth() / 1.1))
     fig.legend(handles=handles, loc="outside upper center", ncols=-(-len(handles) // rows))
+
+
+def beta_ticks(ax, betas, few=False):
+    """Ticks at the betas; with `few`, at five of the study's, where the labels would touch."""
+    if few and len(betas) > 4:
+        betas = [-1, 0, 0.5, 1, 2]
+    ax.set_xticks(betas, [f"{beta:g}" for beta in betas])
 
 
 def log2_ticks(ax, values):
@@ -136,11 +131,11 @@ def draw_betas(ax, table, shift=0, **style):
     ax.plot(table.index + shift, table["mean"], **{"color": "0.7", "zorder": 1, **style})
     for beta in table.index:
         draw_intervals(ax, [beta + shift], table.loc[[beta]], **look(beta))
-    ax.set_xticks(table.index, [f"{beta:g}" for beta in table.index])
+    beta_ticks(ax, table.index)
 
 
 def draw_grid(ax, sizes, title):
-    """Markers at n_envs and beta, the area by sizes in [0, 1]; a ring for each n_envs's largest."""
+    """Markers of the area `sizes`, in [0, 1], at n_envs and beta; a ring around the largest."""
     for column, n_envs in enumerate(sizes):
         for row, (beta, size) in enumerate(sizes[n_envs].items()):
             if not np.isnan(size):
@@ -155,9 +150,9 @@ def draw_grid(ax, sizes, title):
 # --- Figures of the noise -------------------------------------------------------------------------
 
 
-def draw_noise(beta, *size):
+def draw_noise(beta, *size, seed=0):
     """Sequences (*size, 1000), the paper's length, from the same random numbers for each beta."""
-    return colored_noise(beta, (*size, 1000), generator=torch.Generator().manual_seed(0))
+    return colored_noise(beta, (*size, 1000), generator=torch.Generator().manual_seed(seed))
 
 
 def random_walks(betas):
@@ -196,17 +191,14 @@ def power_spectral_density(betas):
 
 def two_step_scatter(betas):
     """Sec. A1: subsequent values are correlated where beta > 0, as measured and in closed form."""
-    fig, axes = panels(
-        len(betas), r"$\varepsilon_t$", r"$\varepsilon_{t+1}$", width=2.2, height=2.2
-    )
+    labels = r"$\varepsilon_t$", r"$\varepsilon_{t+1}$"
+    fig, axes = panels(len(betas), *labels, width=2.2, height=2.2)
     for ax, beta in zip(axes, betas, strict=True):
         noise, lags = draw_noise(beta, 2000).numpy(), autocovariance(beta, 1000)
         correlation = np.corrcoef(noise[:, :-1].ravel(), noise[:, 1:].ravel())[0, 1]
         ax.scatter(noise[:, 500], noise[:, 501], s=3, color=color(beta), alpha=0.5, lw=0)
-        closed_form = float(lags[1] / lags[0])
-        ax.set_title(
-            f"$\\beta = {beta:g}$, correlation {correlation:z.2f}\n(closed form {closed_form:z.2f})"
-        )
+        measured = f"correlation {correlation:z.2f}"
+        ax.set_title(f"$\\beta = {beta:g}$, {measured}\n(closed form {lags[1] / lags[0]:z.2f})")
         ax.set(xlim=(-4.5, 4.5), ylim=(-4.5, 4.5), aspect="equal", xticks=[-4, -2, 0, 2, 4])
     return fig
 
@@ -214,18 +206,15 @@ def two_step_scatter(betas):
 def marginal_distribution(betas):
     """Sec. A1: each step's distribution is Gaussian, its variance near 1 for all beta."""
     fig, axes = panels(len(betas), r"$\varepsilon_t$", "density")
-    x = np.linspace(-4.5, 4.5, 91)
+    x, line = np.linspace(-4.5, 4.5, 91), {"color": "black", "lw": 0.9}
     for ax, beta in zip(axes, betas, strict=True):
         noise, variance = draw_noise(beta, 5000), float(marginal_variance(beta, 1000))
-        ax.hist(
-            noise[:, ::50].flatten().numpy(), bins=x, density=True, color=color(beta), alpha=0.6
-        )
-        ax.plot(x, stats.norm.pdf(x, scale=variance**0.5), color="black", lw=0.9)
+        sample = noise[:, ::50].flatten().numpy()
+        ax.hist(sample, bins=x, density=True, color=color(beta), alpha=0.6)
+        ax.plot(x, stats.norm.pdf(x, scale=variance**0.5), **line)
         ax.set_title(rf"$\beta = {beta:g}$, variance {noise.var():.2f} ({variance:.2f})")
         ax.set(ylim=(0, 0.45), xticks=[-4, -2, 0, 2, 4])
-    legend_above(
-        fig, ("normal distribution of the (closed-form) variance", {"color": "black", "lw": 0.9})
-    )
+    legend_above(fig, ("normal distribution of the (closed-form) variance", line))
     return fig
 
 
@@ -249,25 +238,29 @@ def bias(betas):
 # --- Figures of the results -----------------------------------------------------------------------
 
 
-def compare(runs, x, cells, by=None):
-    """Performance over x, "beta", "n_envs" or "update_size", with a line per value of column `by`.
+def standardized(runs, axes, cells):
+    """The `comparable` runs, with their standardized performance as the column z."""
+    chosen = comparable(runs, axes, cells)
+    return chosen.assign(z=standardize(chosen))
 
-    Standardized within each environment, then averaged over seeds within `cells`, and over those
-    cells that have all values of x and `by`, with two seeds of each if any has: environments, and
-    n_envs (Sec. "Does Colored-Noise Affect the Performance") or betas ("How Does the Number of
-    Parallel Collection Environments").
+
+def compare(runs, x, cells, by=None):
+    """Performance over x: "beta", "n_envs" or "update_size". A line for each value of column `by`.
+
+    Standardized within each environment, then averaged over seeds within `cells`, then over the
+    cells that have all values of x and `by`. Cells are environments, and n_envs (Sec. "Does
+    Colored-Noise Affect the Performance") or betas ("How Does the Number of Parallel Collection
+    Environments").
     """
     need(by or runs[x].nunique() > 1, f"at least two values of {x}")
-    axes = [x, by] if by else [x]
-    chosen = comparable(runs, axes, cells)
-    chosen = chosen.assign(z=analysis.standardize(chosen))
+    chosen = standardized(runs, [x, by] if by else [x], cells)
     xlabel = {"beta": BETA_NAMED, "update_size": "update size n_envs \u00b7 n_steps"}.get(x, x)
     fig, [ax] = panels(1, xlabel, STANDARDIZED, height=3)
     lines, unknown = [], False
     for i, (value, group) in enumerate(chosen.groupby(by) if by else [("", chosen)]):
         gray = ["0.1", "0.65", "0.4", "0.75"][i % 4] if by else INK
         style = {"color": gray, "ls": ["-", "--", ":", "-."][i % 4], "lw": 1}
-        table = analysis.cells_intervals(group, "z", x, cells)
+        table = cells_intervals(group, "z", x, cells)
         unknown |= table.low.isna().any()
         if x == "beta":
             draw_betas(ax, table, shift=0.006 * i, **style)
@@ -309,31 +302,29 @@ def n_epochs_vs_beta(runs):
 def n_envs_beta_grids(runs):
     """Sec. "How Does the Number [...] and Noise Color Interact": marker size = performance^6, rank.
 
-    Beside them the ranks that are projected from the bias of the noise, by our best betas and,
-    where the runs' protocol is the study's, by the paper's.
+    Beside them are the ranks projected from the bias of the noise: by our best betas and, where
+    the runs have the study's protocol, by the paper's.
     """
     need(runs.beta.nunique() > 1, "at least two betas")
-    grid, chosen = analysis.performance_grid(runs)
+    grid, chosen = tables.performance_grid(runs)
     lengths = chosen.noise_seq_len.unique()
     need(len(lengths) == 1, "one --noise-seq-len, of all environments: the projection goes by it")
     best = {"our": grid.idxmax()}
-    if not analysis.differences(chosen).any():
-        best["the paper's"] = (
-            analysis.published("best_beta_per_n_envs").set_index("n_envs").best_beta
-        )
-    axes_of_grid = (grid.index, grid.columns, int(lengths[0]))
+    if not differences(chosen).any():
+        best["the paper's"] = published("best_beta_per_n_envs").set_index("n_envs").best_beta
     ranks = {"rank of performance within n_envs": -grid}
     for whose, betas in best.items():
+        projected = tables.projected_ranks(betas, grid.index, grid.columns, int(lengths[0]))
         title = f"rank projected from the bias,\nby {whose} best $\\beta$"
-        ranks[title] = analysis.projected_ranks(betas, *axes_of_grid).where(grid.notna())
+        ranks[title] = projected.where(grid.notna())
     fig, axes = panels(1 + len(ranks), "n_envs", BETA, width=2.9, height=3.1)
     low, high = np.nanmin(grid), np.nanmax(grid)
     draw_grid(axes[0], ((grid - low) / (high - low or 1)) ** 6, "performance, to the sixth power")
     for ax, (title, order) in zip(axes[1:], ranks.items(), strict=True):
         rank = order.rank()  # 1 the best, of as many betas as this n_envs has
         draw_grid(ax, 1 - (rank - 1) / (rank.count() - 1).clip(lower=1), title)
-    title = f"larger is better, ring: best of each n_envs; {extent(chosen, runs)}"
-    fig.suptitle(title, fontsize=9)
+    made_of = extent(chosen, runs)
+    fig.suptitle(f"larger is better, ring: best of each n_envs; {made_of}", fontsize=9)
     return fig
 
 
@@ -347,11 +338,11 @@ def three_betas(runs):
 def learning_curves(runs, curves, by):
     """Sec. A10: mean return over training, a panel per value of `by`, a line per beta.
 
-    A band is its interval; open markers at the right end are the published final returns, where
-    the runs' protocol is the study's.
+    A band is a line's interval. Open markers at the right end are the published final returns,
+    where the runs have the study's protocol.
     """
-    paper = analysis.published("final_return_per_beta").set_index([*CELL, "beta"]).final_return_mean
-    as_in_study = analysis.differences(runs) == ""
+    paper = published("final_return_per_beta").set_index([*CELL, "beta"]).final_return_mean
+    as_in_study = differences(runs) == ""
     fig, axes = panels(runs[by].nunique(), "environment steps", "mean return")
     for ax, (_, group) in zip(axes, runs.groupby(by), strict=True):
         environment, n_envs = group[CELL].iloc[0]
@@ -360,12 +351,12 @@ def learning_curves(runs, curves, by):
         ax.axvline(end, color="0.8", lw=0.8)
         for i, (beta, seeds) in enumerate(group.groupby("beta")):
             line = lines.loc[seeds.index].dropna(axis=1)
-            mean, low, high = analysis.mean_interval(line, n_resamples=1000)
+            mean, low, high = mean_interval(line, n_resamples=1000)
             marks = {"markevery": (i * every // 3 % line.shape[1], every), "ms": 4}
             ax.plot(line.columns, mean, **look(beta), **marks)
             ax.fill_between(line.columns, low, high, color=color(beta), alpha=0.2, lw=0)
             if as_in_study[seeds.index].all():
-                final = paper.get((environment, n_envs, beta_text(beta)), np.nan)
+                final = paper.get((environment, n_envs, f"{beta:g}"), np.nan)
                 ax.plot(1.05 * end, final, mfc="none", **look(beta))
         ax.set_title(f"{environment}, n_envs {n_envs}")
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -382,48 +373,36 @@ def transfer(runs):
     environment, (c) over all; each over the environments that have all betas (of all methods).
     """
     methods = [method for method in METHOD_LOOK if (runs.method == method).any()]
-    need(set(methods) - {"ppo"}, "runs of `baselines.py trpo` or `a2c` with n_envs 4")
-    groups = {name: runs[runs.method == name] for name in methods if name != "ppo"}
+    need(set(methods) - {"ppo"}, "runs of TRPO or A2C with n_envs 4")
+    groups = {name.upper(): runs[runs.method == name] for name in methods if name != "ppo"}
     if len(methods) > 1:
         shared = set.intersection(*(set(runs.beta[runs.method == name]) for name in methods))
-        groups["overall"] = analysis.same_protocol(runs[runs.beta.isin(shared)])
-    chosen = {}
+        groups["overall"] = same_protocol(runs[runs.beta.isin(shared)])
     for name, group in groups.items():
-        try:
-            chosen[name] = comparable(group, ["method", "beta"], ["environment"])
-        except Unusable:
-            continue
-    need(chosen, "an environment with all betas of a method")
-    fig, axes = panels(len(chosen), BETA, STANDARDIZED, width=3.2, height=2.8)
-    for ax, (name, group) in zip(axes, chosen.items(), strict=True):
-        group = group.assign(z=analysis.standardize(group))
+        groups[name] = standardized(group, ["method", "beta"], ["environment"])
+    fig, axes = panels(len(groups), BETA, STANDARDIZED, width=3.2, height=2.8)
+    for ax, (name, group) in zip(axes, groups.items(), strict=True):
         for i, (method, part) in enumerate(group.groupby("method")):
-            table = analysis.cells_intervals(part, "z", "beta", ["environment"])
+            table = cells_intervals(part, "z", "beta", ["environment"])
             if name == "overall":
                 draw_intervals(ax, table.index + 0.03 * (i - 1), table, **METHOD_LOOK[method])
             else:
                 draw_betas(ax, table)
-        betas = sorted(group.beta.unique())
-        labels = betas if len(betas) < 5 else [-1, 0, 0.5, 1, 2]
-        ax.set_xticks(labels, [f"{beta:g}" for beta in labels])
-        n = group.environment.nunique()
-        count = f"{n} environment{'s'[: n > 1]}, {len(group)} runs"
-        ax.set_title(f"{name if name == 'overall' else METHOD_NAMES[name]}\n{count}")
-    if "overall" in chosen:
-        legend_above(fig, *((METHOD_NAMES[name], METHOD_LOOK[name]) for name in methods))
+        beta_ticks(ax, sorted(group.beta.unique()), few=True)
+        ax.set_title(f"{name}\n{environments(group.environment.nunique())}, {len(group)} runs")
+    if "overall" in groups:
+        legend_above(fig, *((method.upper(), METHOD_LOOK[method]) for method in methods))
     return fig
 
 
 def gsde_vs_beta(runs):
     """Sec. A13: gSDE, which has no beta, beside the betas of PPO with colored noise."""
-    need((runs.method == "gsde").any(), "runs of `baselines.py gsde`")
-    need(runs.beta.notna().any(), "runs with colored noise to compare gSDE with")
-    noise = runs.beta.fillna(np.inf)  # inf: gSDE
-    as_ppo = {*analysis.STUDY, "bootstrap_timeouts"} - {"method"}
-    runs = analysis.same_protocol(runs, sorted(as_ppo)).assign(noise=noise)
-    chosen = comparable(runs, ["noise"], CELL)
-    chosen = chosen.assign(z=analysis.standardize(chosen))
-    table = analysis.cells_intervals(chosen, "z", "noise", CELL)
+    need(runs.method.nunique() > 1, "runs of gSDE and runs with colored noise")
+    shared = [argument for argument in SETTINGS if argument != "method"]
+    runs = same_protocol(runs, [*shared, "bootstrap_timeouts"])
+    runs = runs.assign(noise=runs.beta.fillna(np.inf))  # inf: gSDE
+    chosen = standardized(runs, ["noise"], CELL)
+    table = cells_intervals(chosen, "z", "noise", CELL)
     betas, gsde = table.drop(np.inf), table.loc[[np.inf]]
     fig, [ax] = panels(1, BETA_NAMED, STANDARDIZED, height=3)
     x = betas.index.max() + 0.5
@@ -444,7 +423,7 @@ def complex_tasks(runs):
     ylabel = "performance\n(mean, 95 % BCa interval)"
     fig, axes = panels(chosen.environment.nunique(), BETA, ylabel)
     for ax, (environment, group) in zip(axes, chosen.groupby("environment"), strict=True):
-        table = analysis.cells_intervals(group, "performance", "beta", ["n_envs"])
+        table = cells_intervals(group, "performance", "beta", ["n_envs"])
         draw_betas(ax, table)
         no_interval = "\n(one run each: no interval)" * bool(table.low.isna().any())
         ax.set_title(environment + no_interval)
@@ -464,15 +443,14 @@ def final_return_vs_n_envs(table, betas):
     fig, axes = panels(table.environment.nunique(), "n_envs", "final return")
     for ax, (environment, group) in zip(axes, table.groupby("environment"), strict=True):
         for beta, cells in group.groupby("beta"):
-            # side by side
+            # The betas of one n_envs stand side by side
             x = cells.n_envs * 2 ** (0.5 * (betas.index(beta) + 0.5) / len(betas) - 0.25)
-            open_marker = {"ms": 7, "mfc": "none", "marker": look(beta)["marker"]}
-            ax.plot(x, cells.paper, color=color(beta), ls=":", lw=0.9, **open_marker)
+            ax.plot(x, cells.paper, **look(beta), **PAPER, ms=7)
             draw_intervals(ax, x, cells, **look(beta), ms=4)
         log2_ticks(ax, table.n_envs)
         ax.set(title=environment, xlim=(table.n_envs.min() / 1.5, table.n_envs.max() * 1.5))
     ours = ("ours, 95 % BCa interval", {"marker": "o", "ms": 4})
-    paper = ("paper", {"ls": ":", "lw": 0.9, "marker": "o", "ms": 7, "mfc": "none"})
+    paper = ("paper", {**PAPER, "marker": "o", "ms": 7})
     legend_above(fig, ours, *[paper] * bool(table.paper.notna().any()), betas=betas)
     return fig
 
@@ -480,10 +458,10 @@ def final_return_vs_n_envs(table, betas):
 def beside_published(averages, runs):
     """Sec. A14: final returns beside the paper's, of each cell and averaged over environments.
 
-    averages: of `average_final_returns`.
+    averages: the table of `average_final_returns`.
     """
-    runs = analysis.on_published_scale(runs)
-    cells = analysis.mean_intervals(runs, "final_return", [*CELL, "beta"])
+    runs = tables.on_published_scale(runs)
+    cells = mean_intervals(runs, "final_return", [*CELL, "beta"])
     cells["paper"] = runs.groupby([*CELL, "beta"]).paper.first()
     fig, axes = panels(1 + averages.n_envs.nunique(), BETA, height=2.6)
     axes[0].axline((0, 0), slope=1, color="0.6", lw=0.9)
@@ -494,16 +472,14 @@ def beside_published(averages, runs):
     axes[0].set_xlabel("published final return")
     for ax, (n_envs, table) in zip(axes[1:], averages.groupby("n_envs"), strict=True):
         table = table.set_index("beta")
-        ax.plot(table.index, table.paper, color="0.7", ls=":", lw=0.9)
+        ax.plot(table.index, table.paper, **PAPER, color="0.7")
         for beta, paper in table.paper.items():
-            ax.plot(beta, paper, **{**look(beta), "ms": 8, "mfc": "none"})
+            ax.plot(beta, paper, **look(beta), **PAPER, ms=8)
         draw_betas(ax, table)
-        if len(table) > 4:  # or their labels would touch
-            ax.set_xticks([-1, 0, 0.5, 1, 2], ["-1", "0", "0.5", "1", "2"])
-        count = int(table.environments.iloc[0])
-        ax.set_title(f"n_envs {n_envs}, {count} environment{'s'[: count > 1]}")
+        beta_ticks(ax, table.index, few=True)
+        ax.set_title(f"n_envs {n_envs}, {environments(int(table.environments.iloc[0]))}")
         ax.set_ylabel("averaged over environments")
-    paper = ("paper", {"ls": ":", "lw": 0.9, "marker": "o", "ms": 8, "mfc": "none"})
+    paper = ("paper", {**PAPER, "marker": "o", "ms": 8})
     ours = ("ours, 95 % BCa interval", {"marker": "o"})
     legend_above(fig, ours, paper, betas=sorted(cells.index.unique("beta")))
     return fig
@@ -524,6 +500,22 @@ def robust_performance(table):
     return fig
 
 
+# --- The environments -----------------------------------------------------------------------------
+
+
+def first_frame(env_id):
+    """A square picture of the environment's first state."""
+    env = ppo.make_env(ppo.parse_args(["--env-id", env_id]), render_mode="rgb_array")
+    env.reset(seed=1)
+    frame = env.render()
+    env.close()
+    height, width, _ = frame.shape
+    if env_id.startswith("dm_control/"):
+        return frame[:, (width - height) // 2 : (width + height) // 2]
+    margin = max(0, width - height) // 2  # Mountain Car's is wide: square with its own sky
+    return np.pad(frame, ((margin, margin), (0, 0), (0, 0)), mode="edge")
+
+
 def contact_sheet():
     """A frame of each of the paper's environments, in the order of its figure of them (Sec. A4)."""
     tasks = ["cartpole-balance_sparse", "cartpole-swingup_sparse", "ball_in_cup-catch"]
@@ -531,18 +523,7 @@ def contact_sheet():
     ids = ["MountainCarContinuous-v0", *(f"dm_control/{task}-v0" for task in tasks), "door-v0"]
     ids += ["PointUMaze-v1", "AntUMaze-v1", "Point4Rooms-v1", "SwimmerUMaze-v1"]
     ids += ["Swimmer4Rooms-v1", "Ant4Rooms-v1", *COMPLEX]
-
-    def first_frame(env_id):  # a function: this environment's renderer goes before the next one's
-        env = make_render_env(env_id)
-        env.reset(seed=1)
-        frame = env.render()
-        env.close()
-        height, width, _ = frame.shape
-        if env_id.startswith("dm_control/"):
-            return frame[:, (width - height) // 2 : (width + height) // 2]
-        margin = max(0, width - height) // 2  # Mountain Car's is wide: square with its own sky
-        return np.pad(frame, ((margin, margin), (0, 0), (0, 0)), mode="edge")
-
+    prepare_rendering()
     fig, axes = plt.subplots(4, 5, figsize=(12, 10.2))
     for ax, env_id in zip(axes.flat, ids, strict=True):
         ax.imshow(first_frame(env_id))
@@ -555,66 +536,59 @@ def contact_sheet():
 def untrained_positions(beta, n_cars=50, n_steps=999, seed=1):
     """Plays Mountain Car with a policy that has learned nothing, exploring as in training.
 
-    Returns the positions of n_cars cars, (n_steps + 1, n_cars); at the goal they stay there.
+    Returns the positions of n_cars cars, (n_steps + 1, n_cars). A car at the goal stays there.
     """
     torch.manual_seed(seed)
-    policy = numpy_policy(Agent(2, 1).requires_grad_(False).actor_mean)  # its std is 1
-    noise = ColoredNoiseProcess(beta, n_cars, 1, seed=seed).sample(n_steps).numpy()
-    envs = make_vector_env("MountainCarContinuous-v0", n_cars)
-    obs, _ = envs.reset(seed=[seed + i for i in range(n_cars)])
-    positions, running = [obs[:, 0].copy()], np.ones(n_cars, bool)
-    for eps in noise:
-        obs, _, terminated, truncated, infos = envs.step(np.clip(policy(obs) + eps, -1, 1))
-        ended = running & (terminated | truncated)
-        running &= ~ended
-        positions.append(np.where(running, obs[:, 0], positions[-1]))
-        for i in np.flatnonzero(ended):
-            positions[-1][i] = infos["final_obs"][i][0]
-    return np.array(positions)
+    policy = ppo.numpy_policy(ppo.Agent(2, 1).actor_mean)
+    env = ppo.make_env(ppo.parse_args(["--env-id", "MountainCarContinuous-v0"]))
+    noise = draw_noise(beta, n_cars, seed=seed).numpy()
+    positions = np.empty((n_steps + 1, n_cars))
+    for car in range(n_cars):
+        obs, _ = env.reset(seed=seed + car)
+        positions[:, car] = obs[0]
+        for step in range(n_steps):
+            action = policy(obs[None])[0] + noise[car, step]  # its standard deviation is 1
+            obs, _, terminated, _, _ = env.step(np.clip(action, -1, 1))
+            positions[step + 1 :, car] = obs[0]
+            if terminated:
+                break
+    return positions
 
 
 def animation(betas, n_frames=100, **cars):
     """`untrained_positions` of each beta on the hill, as frames over an episode of 999 steps."""
-    goal, runs = 0.45, [untrained_positions(beta, **cars) for beta in betas]
-    hill, n_steps = np.linspace(-1.2, 0.6, 200), len(runs[0]) - 1
+    goal, positions = 0.45, [untrained_positions(beta, **cars) for beta in betas]
+    hill, (n_steps, n_cars) = np.linspace(-1.2, 0.6, 200), positions[0].shape
 
     def height(x):
         return 0.45 * np.sin(3 * x) + 0.55
 
     rng = np.random.default_rng(0)
-    lift = 0.04 + 0.14 * rng.random(runs[0].shape[1])  # apart from each other, to be seen
+    lift = 0.04 + 0.14 * rng.random(n_cars)  # or cars at one place would hide each other
     fig, axes = plt.subplots(1, len(betas), figsize=(2.6 * len(betas), 2.1), squeeze=False)
-    dots, titles = [], []
+    dots = []
     for ax, beta in zip(axes[0], betas, strict=True):
         ax.fill_between(hill, height(hill), color="0.85", lw=0)
         ax.plot([goal] * 2, [0.99, 1.3], color=INK, lw=1.5)
         ax.fill([goal, goal, goal + 0.12], [1.3, 1.18, 1.24], color="#D55E00", lw=0)
         dots += ax.plot([], [], "o", color=color(beta), ms=3.5, alpha=0.7, mew=0)
-        titles.append(ax.set_title("\n"))
-        ax.set(xlim=(-1.2, 0.62), ylim=(0, 1.4), xticks=[], yticks=[])
+        ax.set(title="\n", xlim=(-1.2, 0.62), ylim=(0, 1.4), xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
 
     def draw(frame):
-        step = round(n_steps * frame / (n_frames - 1))
-        for beta, positions, dot, title in zip(betas, runs, dots, titles, strict=True):
-            x, there = positions[step], (positions[step] >= goal).sum()
+        step = round((n_steps - 1) * frame / (n_frames - 1))
+        for beta, each, dot in zip(betas, positions, dots, strict=True):
+            x = each[step]
             dot.set_data(x, height(x) + lift)
             name = {0: " (white)", 1: " (pink)", 2: " (red)"}.get(beta, "")
-            name = f"$\\beta = {beta:g}${name}, step {step}"
-            title.set_text(f"{name}\nat the goal: {there} of {len(x)}")
+            there = f"at the goal: {(x >= goal).sum()} of {n_cars}"
+            dot.axes.set_title(f"$\\beta = {beta:g}${name}, step {step}\n{there}")
 
-    pause = [n_frames - 1] * 25
+    pause = [n_frames - 1] * (n_frames // 4)
     return FuncAnimation(fig, draw, [*range(n_frames), *pause])
 
 
 # --- Output ---------------------------------------------------------------------------------------
-
-
-def remove(out, names):
-    """Removes figures and tables of these names: an earlier command made them, of other data."""
-    for name in names:
-        for suffix in ("png", "pdf", "csv", "md", "tex"):
-            (out / f"{name}.{suffix}").unlink(missing_ok=True)
 
 
 def make_all(todo, out):
@@ -633,10 +607,9 @@ def make_all(todo, out):
             made[name] = make(data, *rest)
         except Unusable as error:
             not_made.append(f"{name}: {error}")
-            remove(out, [name])
             continue
         if isinstance(made[name], pd.DataFrame):
-            analysis.save_table(made[name], out, name)
+            tables.save_table(made[name], out, name)
         else:
             made[name].savefig(out / f"{name}.png", dpi=200)
             made[name].savefig(out / f"{name}.pdf")
@@ -655,45 +628,48 @@ def noise(betas):
     }
 
 
-def results(methods, curves, betas=None):
-    """What `make_all` is to make of runs, from `select_methods`, and their curves.
+def averaged(runs):
+    """The runs that the paper averages over: with colored noise, and not of a complex task."""
+    return runs[~runs.env_id.isin(COMPLEX) & ~runs.vanilla]
 
-    Of the first method, but Sec. A7 and A13. betas: to draw curves of, by default at most three.
+
+def results(methods, curves, betas):
+    """What `make_all` is to make of runs, as `select_methods` returns them, and of their curves.
+
+    All is of the first method, except where methods are compared (Sec. A7, A13). betas: those
+    that have learning curves.
     """
+
+    def of(*names):  # runs of several methods
+        grids = [study.runs.main_grid(methods[name])[0] for name in names if name in methods]
+        return averaged(pd.concat(grids))
+
     runs = next(iter(methods.values()))
-    grid, _ = analysis.main_grid(runs)
-    studied = {name: analysis.main_grid(each)[0] for name, each in methods.items()}
-    studied = {
-        name: each[~each.env_id.isin(COMPLEX) & ~each.vanilla] for name, each in studied.items()
-    }
-    colored = grid[~grid.vanilla]
-    study = colored[~colored.env_id.isin(COMPLEX)]  # what the paper averages over
-    beyond = runs[~runs.env_id.isin(COMPLEX) & ~runs.vanilla]
-    same_epochs = beyond[beyond.n_epochs.isin(grid.n_epochs[:1])]
-    same_steps = beyond[beyond.n_steps.isin(grid.n_steps[:1])]
-    three = pd.concat([each for name, each in studied.items() if name in METHOD_NAMES])
-    with_gsde = pd.concat([each for name, each in studied.items() if name in ("ppo", "gsde")])
-    betas = betas or three_betas(colored)
+    grid, _ = study.runs.main_grid(runs)
+    colored, main, every = grid[~grid.vanilla], averaged(grid), averaged(runs)
+    same_epochs = every[every.n_epochs.isin(grid.n_epochs[:1])]
+    same_steps = every[every.n_steps.isin(grid.n_steps[:1])]
+    three = of("ppo", "trpo", "a2c")
     todo = {
-        "best_beta_per_env": (analysis.best_beta_per_env, study),
-        "best_beta_per_n_envs": (analysis.best_beta_per_n_envs, study),
-        "final_return_and_performance": (analysis.final_return_and_performance, colored),
-        "final_returns": (analysis.final_returns, grid),
-        "final_return_per_beta": (analysis.final_return_per_beta, "final_returns"),
-        "average_final_returns": (analysis.average_final_returns, study),
-        "robust_statistics": (analysis.robust_statistics, study),
-        "performance_vs_beta": (compare, study, "beta", CELL),
-        "performance_vs_n_envs": (compare, study, "n_envs", ["environment", "beta"]),
-        "n_envs_beta_grids": (n_envs_beta_grids, study),
+        "best_beta_per_env": (tables.best_beta_per_env, main),
+        "best_beta_per_n_envs": (tables.best_beta_per_n_envs, main),
+        "final_return_and_performance": (tables.final_return_and_performance, colored),
+        "final_returns": (tables.final_returns, grid),
+        "final_return_per_beta": (tables.final_return_per_beta, "final_returns"),
+        "average_final_returns": (tables.average_final_returns, main),
+        "robust_statistics": (tables.robust_statistics, main),
+        "performance_vs_beta": (compare, main, "beta", CELL),
+        "performance_vs_n_envs": (compare, main, "n_envs", ["environment", "beta"]),
+        "n_envs_beta_grids": (n_envs_beta_grids, main),
         "beta0_vs_vanilla": (beta0_vs_vanilla, grid[~grid.env_id.isin(COMPLEX)]),
         "n_envs_vs_n_steps": (n_envs_vs_n_steps, same_epochs),
         "n_epochs_vs_beta": (n_epochs_vs_beta, same_steps),
         "transfer": (transfer, three[three.n_envs == 4]),
         "complex_tasks": (complex_tasks, colored),
-        "gsde_vs_beta": (gsde_vs_beta, with_gsde),
+        "gsde_vs_beta": (gsde_vs_beta, of("ppo", "gsde")),
         "coverage": (claims.coverage, methods, curves),
         "final_return_vs_n_envs": (final_return_vs_n_envs, "final_returns", betas),
-        "beside_published": (beside_published, "average_final_returns", study),
+        "beside_published": (beside_published, "average_final_returns", main),
         "robust_performance": (robust_performance, "robust_statistics"),
     }
     lines = colored[colored.beta.isin(betas)]
@@ -701,10 +677,57 @@ def results(methods, curves, betas=None):
         todo[f"learning_curves_n_envs_{n_envs}"] = (learning_curves, group, curves, "environment")
     for environment, group in lines.groupby("environment"):
         if group.n_envs.nunique() > 1:
-            name = environment.lower().replace(" ", "_")
-            name = "".join(c for c in name if c.isalnum() or c == "_")
+            name = re.sub(r"\W", "", environment.lower().replace(" ", "_"))
             todo[f"learning_curves_{name}"] = (learning_curves, group, curves, "n_envs")
     return todo
+
+
+def remove_earlier(out):
+    """Removes what an earlier command made in this folder, by its report: it is of other data."""
+    report = out / "report.txt"
+    first = report.read_text().partition("\n")[0] if report.exists() else ""
+    if first.startswith("made: "):
+        for name in first.removeprefix("made: ").split(", "):
+            for suffix in ("png", "pdf", "csv", "md", "tex"):
+                (out / f"{name}.{suffix}").unlink(missing_ok=True)
+
+
+def draw_results(args):
+    """The command `results`: makes all that the runs allow, and reports what is left out."""
+    runs, curves = study.runs.load(args.paths, args.env, args.beta, args.n_envs)
+    methods, left_out = study.runs.select_methods(runs, args.method)
+    runs = methods.pop(args.method)
+    need(len(runs) or args.method == "ppo", f"a complete run of the method {args.method}")
+    others = [f"{name}: {len(each)} runs" for name, each in methods.items()]
+    grid, dropped = study.runs.main_grid(runs)
+    parts = [part for _, part in grid.groupby(grid.env_id.isin(COMPLEX))]
+    asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
+    betas = asked or three_betas(grid[~grid.vanilla])
+    no_curves = [f"beta {beta:g}" for beta in sorted(set(grid.beta.dropna()) - set(betas))]
+    no_curves += ["vanilla PPO, never"] * int(grid.vanilla.any())
+    args.out.mkdir(parents=True, exist_ok=True)
+    remove_earlier(args.out)
+    made, not_made = make_all(results({args.method: runs, **methods}, curves, betas), args.out)
+    beside = [claims.outside(made["final_returns"])[-1]] if "final_returns" in made else []
+    beside += claims.offset(grid) if "beside_published" in made else []
+    mixed = study.runs.mixed_evaluations(runs)
+    report = {
+        "left out": left_out,
+        "of other methods, only where these are compared": others,
+        "only where n_steps or n_epochs vary, in no other figure or table": dropped,
+        "missing from the grid of these runs": sum(map(study.runs.missing, parts), []),
+        "averaged though evaluated differently (the mean is the same)": mixed,
+        "not among the learning curves (--beta chooses)": no_curves,
+        "not made": not_made,
+        "final returns beside the published": beside,
+    }
+    file, text = args.out / "report.txt", [f"made: {', '.join(made)}"]
+    print(f"{args.out}: {', '.join(made)}")
+    for title, lines in report.items():
+        head, more = f"{title}: {len(lines)}", f"... and {len(lines) - 10} more, see {file}"
+        text += ["\n  ".join([head, *lines])]
+        print("\n  ".join([head, *lines[:10], *[more] * (len(lines) > 10)]))
+    file.write_text("\n".join(text) + "\n")
 
 
 def parse_args():
@@ -716,89 +739,35 @@ def parse_args():
     results = commands.add_parser("results", help="figures and tables of runs")
     sheet = commands.add_parser("environments", help="a frame of each of the paper's environments")
     cars = commands.add_parser("animation", help="untrained policies in Mountain Car, a GIF")
-    for each in (parser, noise, results, sheet, cars):
-        each.error = lambda message: fail(f"{message} (--help lists the arguments)", code=2)
-    analysis.add_runs(results)
-    methods = {"default": "ppo", "choices": analysis.METHODS}
+    study.runs.add_runs(results)
+    methods = {"default": "ppo", "choices": list(METHOD_LOOK)}
     results.add_argument("--method", **methods, help="which method's runs (default: ppo)")
-    default = {"default": STUDY_BETAS, "help": "default: those of the study"}
-    noise.add_argument("--beta", nargs="+", type=analysis.finite, **default)
-    for command in (noise, results):
-        folder = "for figures and tables; those of an earlier command are replaced or removed"
-        command.add_argument("--out", type=Path, default=Path("figures"), help=f"folder {folder}")
-    cars.add_argument("--beta", nargs="+", type=analysis.finite, default=[0.0, 0.5, 1.0])
-    for command, name in ((sheet, "environments.png"), (cars, "animation.gif")):
-        picture = {"default": Path("results") / name, "help": "the picture's file"}
-        command.add_argument("--out", type=Path, **picture)
+    noise.add_argument("--beta", nargs="+", type=float, default=BETAS, help="default: the study's")
+    cars.add_argument("--beta", nargs="+", type=float, default=[0.0, 0.5, 1.0])
+    for command, default, what in (
+        (noise, "figures", "folder for figures"),
+        (results, "figures", "folder for figures and tables; replaces those of earlier runs"),
+        (sheet, "results/environments.png", "the picture's file"),
+        (cars, "results/animation.gif", "the picture's file"),
+    ):
+        command.add_argument("--out", type=Path, default=Path(default), help=what)
     return parser.parse_args()
-
-
-def draw_results(args):
-    """The command `results`: makes all, removes what earlier data left there, reports the rest."""
-    report = {}
-    runs, curves = analysis.load(args.paths, args.env, args.beta, args.n_envs)
-    need(
-        args.method != "gsde",
-        "another --method: gSDE has no beta, and is drawn beside those of PPO",
-    )
-    methods, report["left out"] = analysis.select_methods(runs, args.method)
-    runs = next(iter(methods.values()))
-    need(len(runs) or args.method == "ppo", f"a complete run of the method {args.method}")
-    others = [f"{name}: {len(each)} runs" for name, each in methods.items() if each is not runs]
-    report["of other methods, only where these are compared"] = others
-    grid, dropped = analysis.main_grid(runs)
-    report["only where n_steps or n_epochs vary, in no other figure or table"] = dropped
-    parts = [part for _, part in grid.groupby(grid.env_id.isin(COMPLEX))]
-    report["missing from the grid of these runs"] = sum(map(analysis.missing, parts), [])
-    mixed = analysis.mixed_evaluations(runs)
-    report["averaged though evaluated differently (the mean is the same)"] = mixed
-    asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
-    betas = asked or three_betas(grid[~grid.vanilla])
-    others = sorted(set(grid.beta.dropna()) - set(betas))
-    others = [f"beta {b:g}" for b in others] + ["vanilla PPO, never"] * int(grid.vanilla.any())
-    report["not among the learning curves (--beta chooses)"] = others
-    todo = results(methods, curves, betas)
-    args.out.mkdir(parents=True, exist_ok=True)
-    file = args.out / "report.txt"
-    earlier = file.read_text().partition("\n")[0] if file.exists() else ""
-    made, report["not made"] = make_all(todo, args.out)
-    finals = made.get("final_returns")
-    outside = [] if finals is None else [claims.outside(finals)[-1]]
-    outside += claims.offset(grid) if "beside_published" in made else []
-    report["final returns beside the published"] = outside
-    if earlier.startswith("made: "):
-        remove(args.out, set(earlier.removeprefix("made: ").split(", ")) - set(made))
-    text = [f"made: {', '.join(made)}"]
-    print(f"{args.out}: {', '.join(made)}")
-    for title, lines in report.items():
-        head, more = f"{title}: {len(lines)}", f"... and {len(lines) - 10} more, see {file}"
-        text.append("\n  ".join([head, *lines]))
-        print("\n  ".join([head, *lines[:10], *[more] * (len(lines) > 10)]))
-    file.write_text("\n".join(text) + "\n")
 
 
 def main():
     args = parse_args()
+    plt.switch_backend("Agg")  # figures are written to files, not shown
     if args.command == "results":
         draw_results(args)
     elif args.command == "noise":
         args.out.mkdir(parents=True, exist_ok=True)
-        made, _ = make_all(noise(sorted({beta + 0.0 for beta in args.beta})), args.out)
+        made, _ = make_all(noise(sorted(set(args.beta))), args.out)
         print(f"{args.out}: {', '.join(made)}")
+    elif args.command == "environments":
+        contact_sheet().savefig(args.out, dpi=85)
     else:
-        types = ["gif"] if args.command == "animation" else FigureCanvasBase.filetypes
-        if args.out.suffix[1:] not in types or not args.out.parent.is_dir():
-            ends = "in .gif " if args.command == "animation" else "as a picture's does "
-            raise Unusable(f"--out {args.out} has to end {ends}and be in a folder that exists")
-        silence()
-        if args.command == "animation":
-            animation(args.beta).save(args.out, PillowWriter(fps=15), dpi=100)
-        else:
-            contact_sheet().savefig(args.out, dpi=85)
+        animation(args.beta).save(args.out, PillowWriter(fps=15), dpi=100)
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (Unusable, OSError, gym.error.Error) as error:
-        fail(error)
+    main()

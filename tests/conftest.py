@@ -1,9 +1,10 @@
+"""Helpers of all tests: the script in this process, and what a run leaves behind."""
+
+import csv
+import importlib.util
 import os
-import runpy
 import subprocess
 import sys
-import time
-import traceback
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -17,70 +18,97 @@ import pytest  # noqa: E402
 SCRIPT = ROOT / "ppo_colored_continuous.py"
 TINY = "--total-timesteps 4096 --n-envs 2 --n-steps 256 --eval-freq 512 --eval-episodes 2 "
 TINY += "--n-epochs 1 --no-compile"
-
-
-def run_forked(script, argv, folder, timeout):
-    """Runs a script as `python script argv` does, in a fork of this process: nothing is imported
-    anew, which is most of the time of a short run. Returns the completed process."""
-    import ppo_colored_continuous  # noqa: F401  so that the fork finds all imported
-
-    out, err = folder / f"stdout_{time.time_ns()}", folder / f"stderr_{time.time_ns()}"
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            for fd, path in ((1, out), (2, err)):
-                os.dup2(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND), fd)
-            sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
-            sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
-            sys.argv = [str(script), *argv]
-            runpy.run_path(str(script), run_name="__main__")
-            code = 0
-        except SystemExit as error:
-            code = error.code or 0
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    end = time.monotonic() + timeout
-    while (ended := os.waitpid(pid, os.WNOHANG))[0] == 0:
-        if time.monotonic() > end:
-            os.kill(pid, 9)
-        time.sleep(0.005)
-    texts = [path.read_text() for path in (out, err)]
-    out.unlink()
-    err.unlink()
-    return subprocess.CompletedProcess(argv, os.waitstatus_to_exitcode(ended[1]), *texts)
-
-
-@pytest.fixture
-def train(tmp_path):
-    """train("--beta 0", ...) runs the script to its end in tmp_path / "runs".
-
-    Returns the completed process. With environment variables, `env`, it is a fresh Python.
-    """
-
-    def run(flags="", env=None, timeout=120):
-        argv = ["--runs-dir", str(tmp_path / "runs"), *flags.split()]
-        if env is None:
-            return run_forked(SCRIPT, argv, tmp_path, timeout)
-        variables = {k: v for k, v in {**os.environ, **env}.items() if v is not None}
-        command = [sys.executable, str(SCRIPT), *argv]
-        return subprocess.run(
-            command, capture_output=True, text=True, env=variables, timeout=timeout
-        )
-
-    return run
+EDITED = "--env-id Pendulum-v1 --total-timesteps 2048 --n-envs 2 --n-steps 256 --eval-freq 1024 "
+EDITED += "--eval-episodes 2 --n-epochs 1 --learning-rate 1e-2"
 
 
 @pytest.fixture
 def tiny():
     """Flags of a run of 8 updates and 8 evaluations that takes a second."""
     return TINY
+
+
+@pytest.fixture
+def train(tmp_path):
+    """train("--beta 0", ...) runs the script in this process; returns the run's folder."""
+    import ppo_colored_continuous as ppo
+
+    def run(flags="", **methods):
+        args = ppo.parse_args([*flags.split(), "--runs-dir", str(tmp_path / "runs")])
+        ppo.main(args, **methods)
+        return ppo.run_path(args)
+
+    return run
+
+
+@pytest.fixture
+def start(tmp_path):
+    """start("--beta 0", ...) starts the script as a program of its own; returns the process."""
+
+    def start_process(flags="", script=SCRIPT, **kwargs):
+        command = [sys.executable, script, *flags.split(), "--runs-dir", str(tmp_path / "runs")]
+        how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(command, **how, **kwargs)
+
+    return start_process
+
+
+@pytest.fixture
+def read_evaluations():
+    """read_evaluations(folder): the rows of evaluations.csv, dicts of numbers."""
+
+    def read(folder):
+        with open(folder / "evaluations.csv") as file:
+            return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+
+    return read
+
+
+@pytest.fixture
+def read_events():
+    """read_events(folder): {tag: [(step, value), ...]}, as TensorBoard shows them."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    def read(folder):
+        events = EventAccumulator(str(folder)).Reload()
+        tags = events.Tags()["scalars"]
+        return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
+
+    return read
+
+
+@pytest.fixture
+def run_edited(tmp_path, read_events):
+    """run_edited((old, new), ..., flags=...): runs a copy of the script with these edits.
+
+    Returns the final agent, TensorBoard's points, and the module.
+    """
+
+    def run(*edits, flags="--no-compile", again="--overwrite", **methods):
+        text = SCRIPT.read_text()
+        for old, new in edits:
+            assert old in text, f"the script has no longer: {old}"
+            text = text.replace(old, new)
+        path = tmp_path / "edited.py"
+        path.write_text(text)
+        spec = importlib.util.spec_from_file_location("edited", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        args = module.parse_args(
+            [*f"{EDITED} {flags} {again}".split(), "--runs-dir", str(tmp_path / "runs")]
+        )
+        agents = []
+
+        def make_agent(*sizes):
+            agents.append(module.Agent(*sizes))
+            return agents[-1]
+
+        module.main(args, make_agent=make_agent, **methods)
+        events = read_events(module.run_path(args))
+        scalars = {tag: [value for _, value in points] for tag, points in events.items()}
+        return agents[-1], scalars, module
+
+    return run
 
 
 @pytest.hookimpl(optionalhook=True)

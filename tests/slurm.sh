@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs a Slurm of one node on this machine, for test_sweep.py: Debian's packages, as root, without systemd.
+# Runs a Slurm of one node on this machine, for test_run_sweep.py: Debian's packages, as root, without systemd.
 # Doing it twice does no harm. A Slurm that is configured already is left as it is.
 set -euo pipefail
 conf=/etc/slurm/slurm.conf
@@ -31,8 +31,6 @@ SelectTypeParameters=CR_CPU
 SchedulerParameters=sched_interval=2,bf_interval=2,sched_min_interval=0
 SlurmdParameters=config_overrides
 ReturnToService=2
-# Small, so that run_sweep.sh has to submit several arrays
-MaxArraySize=2
 KillWait=10
 StateSaveLocation=$state/ctld
 SlurmdSpoolDir=$state/d

@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy import stats
 
-import analysis
 from colored_noise import (
     PUBLISHED_BEST_BETA,
     ColoredNoiseProcess,
@@ -18,6 +17,8 @@ from colored_noise import (
     mean_std,
     projected_beta,
 )
+from study.runs import published
+from study.tables import projected_ranks
 
 BETAS = [-1, 0, 0.2, 0.5, 0.75, 1, 1.25, 2]
 
@@ -216,7 +217,7 @@ def test_the_default_dtype_does_not_matter():
 
 
 def test_projected_beta_solves_the_papers_argument():
-    best = analysis.published("best_beta_per_n_envs").set_index("n_envs").best_beta
+    best = published("best_beta_per_n_envs").set_index("n_envs").best_beta
     assert best.to_dict() == PUBLISHED_BEST_BETA
     star = np.mean([mean_std(beta, 1000).item() / n**0.5 for n, beta in best.items()])
     betas = [projected_beta(n) for n in best.index]
@@ -225,7 +226,7 @@ def test_projected_beta_solves_the_papers_argument():
         assert projected_beta(n // 2, 4096) == projected_beta(n) if n > 1 else True
     # the study's beta that is projected to be best is a neighbor of this one, or the nearest
     study = np.array([-1, 0, 0.2, 0.5, 0.75, 1, 1.25, 2])
-    firsts = analysis.projected_ranks(best, study, list(best.index)).idxmin()
+    firsts = projected_ranks(best, study, list(best.index)).idxmin()
     for first, beta in zip(firsts, betas, strict=True):
         below, above = study[study <= beta].max(), study[study >= beta].min()
         assert first in (below, above)

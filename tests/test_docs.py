@@ -1,28 +1,28 @@
 """README and docs: what they say can be run, is run here, shortened; what they link to is there."""
 
+import contextlib
+import io
 import os
 import re
-import shlex
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
-from scipy import stats
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 
-import claims
 import ppo_colored_continuous as ppo
-from analysis import final_return_per_beta, final_returns, load, mean_interval, select_methods
 from colored_noise import PUBLISHED_BEST_BETA, autocovariance, projected_beta
 
+ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 OWN = (ROOT / "docs" / "environments.md").read_text()
 SWEEPS = (ROOT / "docs" / "sweeps.md").read_text()
+LESSON = (ROOT / "docs" / "lesson.md").read_text()
 PAGES = [ROOT / "README.md", ROOT / "results" / "README.md", *(ROOT / "docs").glob("*.md")]
 TRAINING = "--total-timesteps 2048 --eval-freq 1024 --eval-episodes 2 --n-steps 256 --no-compile"
 
@@ -36,23 +36,16 @@ def section(text, heading):
     return text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
 
 
-def run(command, folder, **shorter):
-    """Runs a command of a page in another folder than the repository's; shorter: old=new words."""
-    for old, new in shorter.items():
-        assert old in command
-        command = command.replace(old, new)
+def run(command, folder, old="", new=""):
+    """Runs a command of a page in another folder than the repository's; returns what it says."""
+    assert old in command
+    command = command.replace(old, new) if old else command
     command = re.sub(r"(^|&& )python (\w+\.py)", rf"\1{sys.executable} {ROOT}/\2", command)
-    command = re.sub(r"^\./run_sweep.sh", f"{ROOT}/run_sweep.sh", command)
-    env = {**os.environ, "PYTHON": sys.executable}
-    process = subprocess.run(
-        ["bash", "-c", command], cwd=folder, env=env, capture_output=True, text=True
-    )
+    command = re.sub(r"(^|&& )python -m", rf"\1{sys.executable} -m", command)
+    how = {"cwd": folder, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
+    process = subprocess.run(["bash", "-c", command], capture_output=True, **how)
     assert process.returncode == 0, (command, process.stdout, process.stderr)
     return process.stdout
-
-
-def test_the_readme_is_short():
-    assert len(README.split()) <= 1300
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -67,22 +60,6 @@ def test_links(page):
         headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE) if anchor else []
         slugs = [re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings]
         assert not anchor or anchor in slugs, target
-
-
-def test_commands_can_be_read():
-    """Every command for the script has flags that there are; what is to be run long is not run."""
-    found = 0
-    for page in PAGES:
-        for block in blocks(page.read_text(), "bash"):
-            for line in block.replace("\\\n", "").splitlines():
-                *_, flags = line.partition("python ppo_colored_continuous.py")
-                if flags:
-                    ppo.parse_args(shlex.split(flags, comments=True))
-                    found += 1
-    assert found >= 2
-
-
-# --- The README, from top to bottom
 
 
 def test_first_command(tmp_path):
@@ -188,151 +165,15 @@ def test_which_beta():
         assert round(std, 2) == said and f"{said}" in text
 
 
-def say(*names):
-    """Runs of files in results, by method, and what they say of the paper's claims."""
-    loaded, curves = load([ROOT / "results" / name for name in names])
-    methods, _ = select_methods(loaded)
-    return methods, claims.coverage(methods, curves)
-
-
-@pytest.fixture(scope="module")
-def measured():
-    """Our runs of the study's grid."""
-    return say("reproduction.csv", "study.csv")
-
-
-def test_the_claims_so_far_are_those_of_the_data(measured):
-    """Every verdict that our runs have something to say on, and no other, in the table's order."""
-    methods, coverage = measured
-    text = (ROOT / "results" / "README.md").read_text()
-    table = text.split("| so far | our runs |\n| --- | --- | --- | --- |\n")[1].split("\n\n")[0]
-    about = coverage[coverage.verdict.ne("") & coverage.runs.ne("none needed")]
-    about = about[about.data.str.contains(r"\d") & ~about.data.str.startswith("needs")]
-    columns = ["where", "says", "verdict", "data"]
-    assert table.splitlines() == [f"| {' | '.join(row)} |" for row in about[columns].to_numpy()]
-    whole, tasks = claims.offset(methods["ppo"])
-    assert whole.split(", where")[0] in text
-    assert all(low in text for low in tasks.split(", ")[:2])
-
-
-def test_the_slices_are_those_of_the_data():
-    text = section((ROOT / "results" / "README.md").read_text(), "Slices of the appendix")
-    methods, coverage = say("reproduction.csv", "study.csv", "slices.csv")
-    about = coverage[coverage["where"].isin(["Fig. A6", "Fig. A8", "Fig. A11", "Fig. A12"])]
-    assert len(about) == 5 and (about.verdict == "open").all()
-    for row in about[["where", "says", "data"]].to_numpy():
-        assert f"| {' | '.join(row)} |" in text
-    runs = methods["ppo"]
-    usual = (runs.n_envs == 4) & (runs.n_steps == 2048) & (runs.n_epochs == 10)
-    half = runs.beta == 0.5
-    columns = [usual & runs.vanilla, usual & (runs.beta == 0), usual & half]
-    columns += [half & (runs.n_steps == n) for n in (4096, 1024)]
-    columns += [half & (runs.n_epochs == n) for n in (5, 20)]
-    for name in ("Mountain Car", "Pendulum Swingup", "Cartpole Balance", "Reacher Hard"):
-        here = [runs[column & (runs.environment == name)].performance.mean() for column in columns]
-        assert f"| {' | '.join([name, *(f'{x:z.1f}' for x in here)])} |" in text
-
-
-@pytest.mark.parametrize(
-    ("file", "varies"), [("noise_length.csv", "noise_seq_len"), ("new_seeds.csv", "batch_size")]
-)
-def test_new_seeds_are_those_of_the_data(file, varies):
-    text = section((ROOT / "results" / "README.md").read_text(), "Where the numbers differ")
-    runs, _ = load([ROOT / "results" / file])
-    runs = runs[runs.status == "complete"]
-    cell = ["env_id", "beta", "n_envs", varies, "bootstrap_timeouts", runs.seed // 100]
-    groups = [x for _, x in runs.groupby(cell) if len(x) >= 10]
-    assert len(groups) >= 4
-    for group in groups:
-        mean, low, high = mean_interval(group.final_return)
-        assert f" {mean:z.1f} [{low:z.1f}, {high:z.1f}] |" in text
-    usual = (runs.beta == "0") & (runs.batch_size == 128) & ~runs.bootstrap_timeouts.astype(bool)
-    thirty = [x.final_return for _, x in runs[usual].groupby(["env_id", "n_envs"]) if len(x) == 30]
-    assert len(thirty) == (2 if varies == "batch_size" else 0)
-    for values in thirty:  # white noise in pendulum
-        mean, low, high = mean_interval(values)
-        assert f"at {mean:.0f} [{low:.0f}, {high:.0f}] (published" in text
-
-
-def test_the_comparisons_of_new_seeds_are_those_of_the_data():
-    text = section((ROOT / "results" / "README.md").read_text(), "Where the numbers differ")
-    runs, _ = load([ROOT / "results" / "new_seeds.csv"])
-    runs = runs[(runs.env_id == "dm_control/pendulum-swingup-v0") & (runs.status == "complete")]
-    runs = runs.assign(default=runs.bootstrap_timeouts.astype(bool))
-
-    def p(a, b, column="final_return"):
-        return f"p = {stats.mannwhitneyu(a[column], b[column]).pvalue:.2f}"
-
-    small, default, usual = {}, {}, {}
-    for n_envs, group in runs.groupby("n_envs"):
-        small[n_envs] = group[group.batch_size == 64]
-        default[n_envs] = group[group.default]
-        usual[n_envs] = group[(group.batch_size == 128) & ~group.default]
-    means = [f"{x[1].performance.mean():.0f}" for x in (small, usual)]
-    sooner = p(small[1], usual[1], "performance")
-    assert f"(performance {means[0]}, these {means[1]}; Mann-Whitney, {sooner})" in text
-    assert f"end where these do ({p(small[1], usual[1])})" in text
-    assert f"does worse ({p(default[1], usual[1])})" in text
-    same_seeds = usual[4][usual[4].seed.isin(small[4].seed)]
-    assert f"n_envs 4: Mann-Whitney, {p(small[4], same_seeds)})" in text
-
-
-def test_the_table_of_agreement_is_the_data(measured):
-    text = section(README, "What agrees with the paper, and what does not")
-    methods, coverage = measured
-    table = final_return_per_beta(final_returns(methods["ppo"])).astype(str)
-    cells = table.set_index(["environment", "n_envs"])
-    for place, beta, numbers in (
-        (("Pendulum Swingup", "4"), "beta 1", "103 [39, 126]"),
-        (("Cartpole Swingup", "4"), "beta 1", "301 [95, 592]"),
-        (("Reacher Hard", "4"), "beta 0", "535 [353, 603]"),
-    ):
-        measured = re.findall(r"[\d.]+", cells.loc[place, beta])
-        said = re.findall(r"\d+", numbers)
-        assert numbers in text and [f"{float(x):.0f}" for x in measured] == said
-    pendulum = methods["ppo"].query("environment == 'Pendulum Swingup'")
-    performance = pendulum.groupby(["beta", "n_envs"]).performance.mean().unstack()
-    best = ", ".join(f"{beta:g}" for beta in performance.idxmax()[[1, 4, 32]])
-    assert f"| Pendulum, β of best performance, n_envs 1, 4, 32 | {best} | 0, 0.5, 1 |" in text
-    verdicts = coverage.set_index("says").data
-    outside, of = re.match(r"(\d+) of (\d+)", verdicts["final returns"]).groups()
-    expected = re.search(r"([\d.]+) expected", verdicts["final returns"])[1]
-    assert f"| {of} cells: published mean outside our interval | {outside} |" in text
-    assert f"{expected} expected" in text
-    lead = re.search(
-        r"over 0 (\S+ \[\S+, \S+\]) \((\d+)", verdicts["beta 0.5 outperforms white noise"]
-    )
-    standard_deviations = lead[1].replace(" ", " standard deviations ", 1)
-    assert f"ahead of white, {lead[2]} environments | {standard_deviations} |" in text
-
-
-def test_sweep_in_three_commands(tmp_path):
-    sweep, status, plot = blocks(section(README, "Sweep"), "bash")[0].splitlines()
-    shorter = {'"0 0.5 1"': '"0 0.5"', '"1 2 3 4 5"': '"1"', " cheetah-run": ""}
-    said = run(f"{sweep} -- {TRAINING}", tmp_path, **shorter)
-    assert "main: 2 of 2 runs are complete, 0 failed" in said
-    assert "main: 2 of 2 done" in run(status, tmp_path, **shorter)
-    run(plot, tmp_path)
-    assert (tmp_path / "figures" / "learning_curves_n_envs_4.png").stat().st_size > 10_000
-
-
 # --- docs
 
 
 def test_an_environment_of_ones_own(tmp_path):
-    """The page's environment and its commands, in the order of the page."""
     text = section(OWN, "Your own environment")
-    (code,) = blocks(text, "python")
-    assert len([line for line in code.splitlines() if line.strip()]) == 25
-    (tmp_path / "my_env.py").write_text(code)
-    train, sweep_and_plot, plays = blocks(text, "bash")
-    sweep, plot = sweep_and_plot.splitlines()
-    steps = {"--total-timesteps 100000 --eval-episodes 10": TRAINING}
-    assert "FindPad-v0" in run(train.strip(), tmp_path, **steps)
-    shorter = {'"0 0.5 1"': '"0 0.5"', '"1 2 3 4 5"': '"1"', **steps}
-    assert "2 of 2 runs are complete" in run(sweep, tmp_path, **shorter)
-    run(plot, tmp_path)
-    assert "my_env:FindPad-v0" in (tmp_path / "figures" / "final_return_per_beta.md").read_text()
+    (tmp_path / "my_env.py").write_text(blocks(text, "python")[0])
+    train, _, plays = blocks(text, "bash")
+    steps = "--total-timesteps 100000 --eval-episodes 10"
+    assert "FindPad-v0" in run(train.strip(), tmp_path, steps, TRAINING)
     for line in plays.splitlines():
         assert "mean return" in run(line, tmp_path)
     assert (tmp_path / "pad.mp4").exists()
@@ -340,11 +181,9 @@ def test_an_environment_of_ones_own(tmp_path):
 
 def test_the_trained_policy_in_python(tmp_path, monkeypatch, train):
     (code,) = blocks(SWEEPS, "python")
-    assert train(f"--beta 0.5 {TRAINING}").returncode == 0
+    train(f"--beta 0.5 {TRAINING}")
     monkeypatch.chdir(tmp_path)
-    names = {}
-    exec(code, names)
-    assert names["agent"].actor_mean(torch.zeros(1, 2)).shape == (1, 1)
+    exec(code, {})
 
 
 def test_every_flag_is_explained():
@@ -354,3 +193,91 @@ def test_every_flag_is_explained():
     for name in vars(ppo.parse_args([])):
         if name not in ("method", "beta_auto"):
             assert name.replace("_", "-") in explained, name
+
+
+# --- The lesson: its snippets print what it says, and its edits apply and do what it says
+
+
+def printed(code):
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(code, {})
+    return out.getvalue()
+
+
+def table(text):
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    return rows[2:]
+
+
+def test_look_at_noise():
+    """What is measured, the closed form, and the table in the text are the same."""
+    text = section(LESSON, "1. Look at noise")
+    lines = printed(blocks(text, "python")[0]).splitlines()
+    measured, closed_form = (
+        [[float(x) for x in re.findall(r"-?\d+\.\d\d", line)] for line in lines[i::2]]
+        for i in (0, 1)
+    )
+    said = [[float(x) for x in row[1:]] for row in table(text)]
+    np.testing.assert_allclose(closed_form, said, atol=1e-9)
+    np.testing.assert_allclose(measured, said, atol=0.011)
+
+
+def test_why_it_works():
+    """With three of the twenty seeds."""
+    code, spectrum = blocks(section(LESSON, "3. Why it works"), "python")
+    lines = printed(code.replace("range(1, 21)", "range(1, 4)")).splitlines()
+    assert [int(re.search(r"found in (\d+)", line)[1]) for line in lines] == [0, 3, 3, 3]
+    power = [float(line.split()[1]) for line in printed(spectrum).splitlines()]
+    assert power == [1.0, 3.1, 5.3, 1.6]
+
+
+def hunks(number):
+    """Pairs of (old lines, new lines) of the lesson's edit of this number."""
+    for hunk in re.split(r"\n\n", blocks(LESSON, "diff")[number - 1].rstrip("\n")):
+        lines = hunk.split("\n")
+        yield tuple("\n".join(line[1:] for line in lines if line[0] == sign) for sign in "-+")
+
+
+def test_edits_1_to_3(run_edited, capsys):
+    """The learning rate falls; ReLU; the norm of the gradient is logged, and changes nothing."""
+    _, scalars, _ = run_edited(*hunks(1))
+    rates = [float(x) for x in re.findall(r"learning rate (\S+)", capsys.readouterr().out)]
+    assert rates == pytest.approx([1e-2 * (1 - i / 4) for i in range(4)])
+    agent, *_ = run_edited(*hunks(2))
+    assert sum(isinstance(layer, torch.nn.ReLU) for layer in agent.modules()) == 4
+    _, scalars, _ = run_edited(*hunks(3))
+    _, original, _ = run_edited()
+    assert min(scalars.pop("losses/grad_norm")) > 0.5  # before clipping
+    assert scalars["evaluation/return_mean"] == original["evaluation/return_mean"]
+
+
+def test_edit_4_ornstein_uhlenbeck_noise(run_edited):
+    agent, _, module = run_edited(*hunks(4))
+    args = module.parse_args(["--n-steps", "20000", "--n-envs", "2", "--total-timesteps", "100000"])
+    agent.actor_mean[-1].weight.data.zero_()
+    agent.actor_mean[-1].bias.data.zero_()
+    agent.log_std.data.zero_()
+    torch.manual_seed(0)
+    act, obs = module.exploration(agent, None, args), np.zeros((2, 3), np.float32)
+    eps = np.array([act(obs, t) for t in range(20_000)])
+    assert eps.var() == pytest.approx(1, abs=0.06)
+    for lag in (1, 5, 10):
+        assert (eps[lag:] * eps[:-lag]).mean() == pytest.approx(0.9**lag, abs=0.07)
+
+
+def test_edit_5_restarts_the_noise(run_edited):
+    """At the end of an episode, and only from the next step on."""
+    seen = []
+    flags = "--no-compile --max-episode-steps 100 --total-timesteps 512 --eval-freq 512"
+    *_, module = run_edited(*hunks(5), flags=flags)
+
+    def spy(*arguments):
+        act = module.exploration(*arguments)
+        seen.append((act.eps, act.eps.copy()))
+        return act
+
+    run_edited(*hunks(5), flags=flags, exploration=spy)
+    after, before = seen[0]
+    changed = (after != before).all(axis=(1, 2))
+    assert not changed[:100].any() and changed[100:].all()  # Pendulum's episodes end together

@@ -1,32 +1,23 @@
 """The paper's other methods, run through ppo_colored_continuous.py: only what differs from it.
 
-    python baselines.py trpo --beta 0.5     Sec. A7: TRPO with colored noise
-    python baselines.py a2c --beta 0.5      Sec. A7: A2C with colored noise
-    python baselines.py gsde                Sec. A13: PPO with state-dependent exploration
+    python -m study.methods trpo --beta 0.5     Sec. A7: TRPO with colored noise
+    python -m study.methods a2c --beta 0.5      Sec. A7: A2C with colored noise
+    python -m study.methods gsde                Sec. A13: PPO with state-dependent exploration
 
 All flags of the script hold (--help), but those that the method does not have. None of this is in
 the paper's released code, and its text gives no hyperparameters, so the defaults are those of
 Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
 """
 
-import functools
+import argparse
 import math
-import os
-import signal
 import sys
-
-if __name__ == "__main__":
-    os.environ["OMP_NUM_THREADS"] = "1"  # for these small networks more threads are slower
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while loading: no traceback
 
 import torch
 from torch import nn
+from torch.func import functional_call
 
 import ppo_colored_continuous as ppo
-import run_files
-from environments import silence
-
-functional_call = functools.partial(torch.func.functional_call, tie_weights=False)  # as ppo_loss
 
 # --- A2C (Mnih et al. 2016): one step of the plain policy gradient for each short rollout
 
@@ -34,7 +25,7 @@ functional_call = functools.partial(torch.func.functional_call, tie_weights=Fals
 def a2c_loss(params, batch, agent, args):
     """The policy gradient's loss, as a function of the flat parameters; batch as in ppo_loss."""
     obs, actions, _, advantages, returns, _ = batch
-    named = agent.unflatten(params)
+    named = ppo.unflatten(params, agent)
     logprobs, entropy, values = functional_call(agent, named, (obs, actions))
     policy_loss = -(advantages * logprobs).mean()
     value_loss = ((returns - values) ** 2).mean()
@@ -54,10 +45,10 @@ def a2c_update(params, optimizer, batch, learning_rate, agent, args):
 
 def a2c_learn(agent, optimizer, batch, learning_rate, update, args):
     """In place of ppo.learn: moves the agent's parameters; returns the optimizer and metrics."""
-    params = nn.utils.parameters_to_vector(agent.parameters())
+    params = nn.utils.parameters_to_vector(ppo.trainable(agent).values()).detach()
     learning_rate = torch.tensor(learning_rate, dtype=torch.float64, device=args.device)
     params, optimizer, metrics = update(params, optimizer, batch, learning_rate, agent, args)
-    nn.utils.vector_to_parameters(params, agent.parameters())
+    nn.utils.vector_to_parameters(params, ppo.trainable(agent).values())
     return optimizer, metrics
 
 
@@ -69,7 +60,7 @@ TARGET_KL, DAMPING, CG_STEPS, LINE_SEARCH_STEPS, SHRINK = 0.01, 0.1, 15, 10, 0.8
 def surrogate(params, batch, agent):
     """Mean of advantage times probability ratio, as a function of the flat parameters."""
     obs, actions, old_logprobs, advantages, *_ = batch
-    logprobs, *_ = functional_call(agent, agent.unflatten(params), (obs, actions))
+    logprobs, *_ = functional_call(agent, ppo.unflatten(params, agent), (obs, actions))
     return (advantages * (logprobs - old_logprobs).exp()).mean()
 
 
@@ -80,7 +71,7 @@ def kl_divergence(params, old_params, obs, agent):
     """
 
     def mean_and_log_std(params):
-        named = agent.unflatten(params)
+        named = ppo.unflatten(params, agent)
         actor = {k.split(".", 1)[1]: p for k, p in named.items() if k.startswith("actor_mean.")}
         return functional_call(agent.actor_mean, actor, obs), named["log_std"]
 
@@ -127,7 +118,7 @@ def trpo_actor(params, batch, agent):
 
 def critic_loss(params, minibatch, agent):
     obs, actions, _, _, returns, _ = minibatch
-    *_, values = functional_call(agent, agent.unflatten(params), (obs, actions))
+    *_, values = functional_call(agent, ppo.unflatten(params, agent), (obs, actions))
     loss = ((returns - values) ** 2).mean()
     return loss, {"value_loss": loss}
 
@@ -145,9 +136,9 @@ def trpo_learn(agent, optimizer, batch, learning_rate, update, args):
     if args.normalize_advantage:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     batch = (obs, actions, logprobs, advantages, *rest)
-    params = nn.utils.parameters_to_vector(agent.parameters())
+    params = nn.utils.parameters_to_vector(ppo.trainable(agent).values()).detach()
     params, actor_metrics = trpo_actor(params, batch, agent)
-    nn.utils.vector_to_parameters(params, agent.parameters())
+    nn.utils.vector_to_parameters(params, ppo.trainable(agent).values())
     optimizer, metrics = ppo.learn(agent, optimizer, batch, learning_rate, update, args)
     return optimizer, metrics | actor_metrics
 
@@ -176,9 +167,9 @@ class GSDEAgent(ppo.Agent):
 
 def gsde_exploration(agent, noise, args):
     """In place of ppo.exploration: a matrix W, (64, action_dim), per environment and rollout."""
-    weights = torch.randn(args.n_envs, *agent.log_std.shape) * agent.log_std.exp().cpu()
-    weights, policy = weights.numpy(), run_files.numpy_policy(agent.actor_mean)
-    hidden = run_files.numpy_policy(agent.actor_mean[:-1])
+    weights = torch.randn(args.n_envs, *agent.log_std.shape) * agent.log_std.exp().detach().cpu()
+    weights, policy = weights.numpy(), ppo.numpy_policy(agent.actor_mean)
+    hidden = ppo.numpy_policy(agent.actor_mean[:-1])
     return lambda obs, t: policy(obs) + (hidden(obs)[:, None, :] @ weights)[:, 0]
 
 
@@ -204,21 +195,20 @@ METHODS = {
 
 
 def main(argv):
-    if not argv or argv[0] not in METHODS:
-        if {"-h", "--help"} & set(argv):
-            print(__doc__.strip())
-            return
-        run_files.fail(f"give a method, {', '.join(METHODS)}, before the flags (--help)", code=2)
-    name, *flags = argv
-    method = METHODS[name]
+    parser = argparse.ArgumentParser(
+        usage="python -m study.methods METHOD [flags of ppo_colored_continuous.py]",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("method", choices=METHODS)
+    name = parser.parse_args(argv[:1]).method
+    method, flags = METHODS[name], argv[1:]
     for flag in method["lacks"]:
         if any(word.split("=")[0] in (f"--{flag}", f"--no-{flag}") for word in flags):
-            run_files.fail(f"{name} has no --{flag}", code=2)
+            parser.error(f"{name} has no --{flag}")
     args = ppo.parse_args(flags, method=name, exp_name=name, **method["defaults"])
     ppo.main(args, **method["replaces"])
 
 
 if __name__ == "__main__":
-    silence()
-    run_files.catch_signals()
     main(sys.argv[1:])

@@ -1,18 +1,17 @@
 """The maze tasks of mujoco-maze (https://github.com/kngwyu/mujoco-maze) on today's MuJoCo.
 
 An ant, a point or a swimmer has to find a goal in a maze of square cells, in some mazes by pushing
-blocks out of its way. The original package needs gym and mujoco-py; this file needs neither and
-follows its version 1 tasks (a sparse reward at the goal) as they were before it moved to gym 0.26.
-Every environment is one `MazeEnv`:
+blocks out of its way. The original package needs gym and mujoco-py, which are no longer maintained.
+This file needs neither. It follows the tasks of version 1, which have a sparse reward at the goal,
+as they were before the package moved to gym 0.26.
 
-    gymnasium.make("AntUMaze-v1")             # after `import environments`, which registers the ids
-    mazes.MazeEnv(robot="ant", maze="UMaze")  # the same, without the limit of 1000 steps
+    gymnasium.make("AntUMaze-v1")       # after `import study.environments`, which registers the ids
+    MazeEnv(robot="ant", maze="UMaze")  # the same, without the limit of 1000 steps
 
 The robots are the XML models that Gymnasium ships; `build_model` changes what differs from them.
 """
 
 import math
-import weakref
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,9 +29,7 @@ POINT_MAX_VELOCITY = 10.0
 
 
 class Maze(NamedTuple):
-    # '#' wall, '.' free, 'R' robot, 'M' block movable in x and y. Columns run along +x, rows along
-    # +y.
-    grid: str
+    grid: str  # '#' wall, '.' free, 'R' robot, 'M' movable block; columns along +x, rows along +y
     goal: tuple[float, float]  # (x, y) in cells, seen from the robot's cell
     scale: dict[str, float]  # side of a cell in m, for each robot that the task has
 
@@ -123,11 +120,10 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
     assets = Path(gym.__file__).parent / "envs/mujoco/assets"
     spec = mujoco.MjSpec.from_file(str(assets / f"{robot}.xml"))
     spec.option.timestep = ROBOTS[robot].timestep
-    # Without the midphase, which is younger than the study's MuJoCo 2.1.0, the ant's steps take
-    # 10 % less time and are the same. The point's contacts come in another order: with the midphase
-    # 1.2 % of its steps at walls end elsewhere (measured: up to 2 cm, 2 m/s), the rest to rounding.
+    # The midphase of collision detection is newer than the study's MuJoCo 2.1.0. Without it the
+    # ant's steps are the same in 10 % less time. The point's contacts come in another order: with
+    # it 1.2 % of the point's steps at walls end elsewhere, by up to 2 cm and 2 m/s.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-    has_blocks = any(c == "M" for c, _, _ in cells)
     if robot == "ant":
         for actuator in spec.actuators:
             actuator.gear[0] = 1
@@ -142,8 +138,9 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
         # makes up for it: a damping ratio of 2**0.5, the mean of this one and the walls', 1.
         spec.geom("pointarrow").solref[1] = 2 * 2**0.5 - 1
 
-    # The spec's default goes to the geoms that are added below; those of the XML are made already.
+    has_blocks = any(c == "M" for c, _, _ in cells)
     solimp = [0.995, 0.995, 0.01] if has_blocks else [0.8, 0.8, 0.01] if robot == "ant" else None
+    # The default is for the geoms that add_maze adds; those of the XML are made already
     for geom in [spec.default.geom, *spec.geoms]:
         if geom.name in ("pointbody", "pointarrow"):
             geom.solimp[:3] = [0.9, 0.99, 0.001]
@@ -154,6 +151,15 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
     floor, tiles = spec.material("MatPlane"), spec.texture("texplane")
     floor.reflectance, tiles.rgb1, tiles.rgb2 = 0, [0.80, 0.82, 0.85], [0.70, 0.72, 0.76]
 
+    add_maze(spec, cells, scale, goal)
+    model = spec.compile()
+    if old_capsule_inertia:
+        set_old_capsule_inertia(model)
+    return model
+
+
+def add_maze(spec, cells, scale, goal):
+    """Adds walls, blocks and a picture of the goal to the MjSpec of a robot."""
     height = scale / 2
     size = [scale / 2, scale / 2, height / 2]
     box = dict(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, contype=1, conaffinity=1)
@@ -168,85 +174,76 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
                 joint = body.add_joint(name=f"block_{i}_{name}", axis=axis)
                 joint.type, joint.margin = mujoco.mjtJoint.mjJNT_SLIDE, 0.01
                 joint.limited, joint.armature, joint.damping = 0, 0, [0, 0, 0]
-    # A post as wide as the goal, which stands out of the wall where the goal is inside one.
+    # A post as wide as the goal. It is higher than the walls, as some goals are inside of one.
     post = spec.worldbody.add_site(name="goal", pos=[*goal, 0.7 * height], rgba=[0.1, 0.7, 0.1, 1])
     post.type, post.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [GOAL_RADIUS, 0.7 * height, 0]
 
-    model = spec.compile()
-    if old_capsule_inertia:
-        set_old_capsule_inertia(model)
-    return model
-
 
 def set_old_capsule_inertia(model):
-    """Give every body made of one capsule the mass and inertia of MuJoCo before 2.1.2, in place.
+    """Gives each body that is one capsule the mass and inertia of MuJoCo before 2.1.2, in place.
 
     A capsule of radius r and cylinder length L was taken for a cylinder of height h = L + r. The
-    swimmer's fluid drag and so its returns depend on it: the published ones need the old values.
+    swimmer's fluid drag depends on it, and so do its returns: the published ones need this.
     """
     for body in range(1, model.nbody):
         first, count = model.body_geomadr[body], model.body_geomnum[body]
         if count == 1 and model.geom_type[first] == mujoco.mjtGeom.mjGEOM_CAPSULE:
             r, half_length, _ = model.geom_size[first]
             h = 2 * half_length + r
-            mass = (
-                model.body_mass[body] * h / (h + r / 3)
-            )  # the exact volume is pi r^2 (L + 4 r / 3)
-            across = mass * (3 * r**2 + h**2) / 12
-            model.body_mass[body] = mass
-            model.body_inertia[body] = [
-                across,
-                across,
-                mass * r**2 / 2,
-            ]  # the capsule's axis is the third
+            # The exact volume is pi r^2 (L + 4 r / 3)
+            model.body_mass[body] = mass = model.body_mass[body] * h / (h + r / 3)
+            across, about = mass * (3 * r**2 + h**2) / 12, mass * r**2 / 2
+            model.body_inertia[body] = across, across, about  # the capsule's axis is the third
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-class WallReflection:
-    """Reflects the point's moves at the faces of the walls, which stand out by the point's radius.
+# --- The point's walls: it is moved by its coordinates, and its moves are reflected
 
-    The original has no face where a wall adjoins the first cell of a block. Its point can leave
-    PushMaze there; this one cannot.
+
+def wall_faces(cells, scale):
+    """The faces of the walls, which stand out by the point's radius.
+
+    Returns tuples (axis, position on this axis, low and high end on the other axis). The original
+    has no face between a wall and the first cell of a block. Its point can leave PushMaze there;
+    this one cannot.
     """
+    reach = scale / 2 + POINT_RADIUS
+    free = {(x, y) for c, x, y in cells if c != "#"}
+    faces = []
+    for c, x, y in cells:
+        for axis, dx, dy in ((1, 0, -1), (0, -1, 0), (1, 0, 1), (0, 1, 0)):
+            if c == "#" and (x + dx * scale, y + dy * scale) in free:
+                across, along = (y + dy * reach, x) if axis else (x + dx * reach, y)
+                faces.append((axis, across, along - reach, along + reach))
+    return faces
 
-    def __init__(self, cells, scale):
-        reach = scale / 2 + POINT_RADIUS
-        free = {(x, y) for c, x, y in cells if c != "#"}
-        self.faces = []  # (axis, position on it, low and high end on the other axis)
-        for c, x, y in cells:
-            for axis, dx, dy in ((1, 0, -1), (0, -1, 0), (1, 0, 1), (0, 1, 0)):
-                if c == "#" and (x + dx * scale, y + dy * scale) in free:
-                    across, along = (y + dy * reach, x) if axis else (x + dx * reach, y)
-                    self.faces.append((axis, across, along - reach, along + reach))
 
-    def first_crossing(self, start, end):
-        """The nearest crossing of the segment start-end with a face.
+def first_crossing(faces, start, end):
+    """The first face that the segment start-end crosses: (distance / length, face), or None."""
+    nearest = None
+    delta = (end[0] - start[0], end[1] - start[1])
+    for face in faces:
+        axis, across, low, high = face
+        a, b = start[axis] - across, end[axis] - across
+        if a * b <= 0 and a != b:
+            t = a / (a - b)
+            on_face = low <= start[1 - axis] + t * delta[1 - axis] <= high
+            if on_face and (nearest is None or t < nearest[0]):
+                nearest = (t, face)
+    return nearest
 
-        Returns (distance / length, face), or None.
-        """
-        nearest = None
-        delta = (end[0] - start[0], end[1] - start[1])
-        for face in self.faces:
-            axis, across, low, high = face
-            a, b = start[axis] - across, end[axis] - across
-            if a * b <= 0 and a != b:
-                t = a / (a - b)
-                on_face = low <= start[1 - axis] + t * delta[1 - axis] <= high
-                if on_face and (nearest is None or t < nearest[0]):
-                    nearest = (t, face)
-        return nearest
 
-    def __call__(self, start, end):
-        """Where a move from start to end, (x, y), arrives: at `end` if no wall is in the way."""
-        hit = self.first_crossing(start, end)
-        if hit is None:
-            return end
-        t, (axis, across, _, _) = hit
-        crossing = [s + t * (e - s) for s, e in zip(start, end, strict=True)]
-        mirrored = list(end)
-        mirrored[axis] = 2 * across - end[axis]
-        arrival = tuple(c + RESTITUTION * (m - c) for c, m in zip(crossing, mirrored, strict=True))
-        return start if self.first_crossing(start, arrival) else arrival
+def reflect(faces, start, end):
+    """Where a move from start to end, (x, y), arrives: at `end` if no wall is in the way."""
+    hit = first_crossing(faces, start, end)
+    if hit is None:
+        return end
+    t, (axis, across, _, _) = hit
+    crossing = [s + t * (e - s) for s, e in zip(start, end, strict=True)]
+    mirrored = list(end)
+    mirrored[axis] = 2 * across - end[axis]
+    arrival = tuple(c + RESTITUTION * (m - c) for c, m in zip(crossing, mirrored, strict=True))
+    return start if first_crossing(faces, start, arrival) else arrival
 
 
 class MazeEnv(gym.Env):
@@ -260,9 +257,9 @@ class MazeEnv(gym.Env):
             results were made.
         render_mode: None or "rgb_array": the whole maze from above, (480, 480, 3) uint8.
 
-    Action: joint torques in [-30, 30] N m (ant, 8) or [-1, 1] times 150 N m (swimmer, 2); for the
-    point a step forward in [-1, 1] m and, before it, a turn in [-0.25, 0.25] rad. Actions beyond
-    are clipped.
+    Action, clipped to its bounds: joint torques in [-30, 30] N m (ant, 8) or [-1, 1] times 150 N m
+    (swimmer, 2); for the point a step forward in [-1, 1] m and, before it, a turn in [-0.25, 0.25]
+    rad.
     Observation: the robot's first three coordinates, the position (x, y, z) of each block, the
     robot's other coordinates, its velocities, 0.001 * step.
     Reward: 1 within 0.6 m of the goal, which terminates the episode, otherwise -0.0001; for ant and
@@ -274,11 +271,6 @@ class MazeEnv(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}
 
     def __init__(self, robot, maze, goal=None, old_capsule_inertia=True, render_mode=None):
-        if maze not in MAZES or robot not in MAZES[maze].scale:
-            choices = ", ".join(f"{r} in {m}" for m in MAZES for r in MAZES[m].scale)
-            raise ValueError(
-                f"no maze task for robot {robot!r} in maze {maze!r}; there are {choices}"
-            )
         self.robot, self.render_mode = robot, render_mode
         self.nq, self.nv, timestep, self.substeps = ROBOTS[robot]
         self.dt = timestep * self.substeps
@@ -287,102 +279,72 @@ class MazeEnv(gym.Env):
         self.goal = tuple(goal) if goal is not None else tuple(scale * c for c in MAZES[maze].goal)
 
         self.cells = read_grid(MAZES[maze].grid, scale)
-        self.reflect = WallReflection(self.cells, scale)
+        self.faces = wall_faces(self.cells, scale)
         self.model = build_model(robot, self.cells, scale, self.goal, old_capsule_inertia)
         self.data = mujoco.MjData(self.model)
-        self._make_views()
+        self.n_blocks = (self.model.nq - self.nq) // 2  # the last bodies, with 2 joints each
 
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
-        obs_dim = self.nq + self.nv + self._block_pos.size + 1
+        obs_dim = self.nq + 3 * self.n_blocks + self.nv + 1
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (obs_dim,), np.float64)
         self._low, self._high = self.model.actuator_ctrlrange.T.copy()
         self._renderer = None
 
-    def _make_views(self):
-        # Views into MuJoCo's memory, kept because making one takes as long as using it.
-        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
-        n_blocks = (self.model.nq - self.nq) // 2
-        first = self.model.nbody - n_blocks
-        self._block_pos = self.data.xpos[first:].reshape(-1)  # (3 * n_blocks,)
-
-    # copy and pickle would make the views arrays of their own, and cannot take a renderer
-    def __getstate__(self):
-        left_out = {"_qpos", "_qvel", "_ctrl", "_block_pos", "_renderer", "_camera"}
-        return {name: value for name, value in self.__dict__.items() if name not in left_out}
-
-    def __setstate__(self, state):
-        self.__dict__.update(state, _renderer=None)
-        self._make_views()
-
     def reset(self, *, seed=None, options=None):
-        """Start an episode: coordinates and velocities are drawn around the model's own.
-
-        Blocks are at rest in place.
-        """
+        """Starts an episode. The robot's coordinates and velocities are drawn near the model's."""
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self._steps = 0
-        self._qpos[: self.nq] += self.np_random.uniform(-0.1, 0.1, self.nq)
+        self.data.qpos[: self.nq] += self.np_random.uniform(-0.1, 0.1, self.nq)
         if self.robot == "swimmer":
-            self._qvel[:] = self.np_random.uniform(-0.1, 0.1, self.nv)
+            self.data.qvel[:] = self.np_random.uniform(-0.1, 0.1, self.nv)
         else:
-            self._qvel[: self.nv] = 0.1 * self.np_random.standard_normal(self.nv)
+            self.data.qvel[: self.nv] = 0.1 * self.np_random.standard_normal(self.nv)
         mujoco.mj_forward(self.model, self.data)
         return self._observation(), {}
 
     def step(self, action):
-        """One step of `dt` seconds with an action of shape (action_dim,).
-
-        Raises ValueError for an action of another shape or with NaN.
-        """
-        action = np.asarray(action)
-        if action.shape != self._low.shape:
-            raise ValueError(f"action of shape {action.shape}, need {self._low.shape}")
+        """One step of `dt` seconds with an action of shape (action_dim,)."""
         action = np.minimum(np.maximum(action, self._low), self._high)
         square = float(action @ action)
-        if math.isnan(square):
-            raise ValueError(f"action with NaN: {action.tolist()}")
         self._steps += 1
-        info = {}
+        qpos, info = self.data.qpos, {}  # a view: it shows each new state
         if self.robot == "point":
             self._move_point(*action.tolist())
             reward = 0.0
         else:
-            x, y = self._qpos[:2].tolist()
-            self._ctrl[:] = action
+            x, y = qpos[:2].tolist()
+            self.data.ctrl[:] = action
             mujoco.mj_step(self.model, self.data, self.substeps)
-            speed = math.hypot(self._qpos[0] - x, self._qpos[1] - y) / self.dt
+            speed = math.hypot(qpos[0] - x, qpos[1] - y) / self.dt
             info = {"reward_forward": speed, "reward_ctrl": -CONTROL_COST * square}
             reward = INNER_REWARD * (speed - CONTROL_COST * square)
-        x, y = self._qpos[:2].tolist()
+        x, y = qpos[:2].tolist()
         reached = math.hypot(x - self.goal[0], y - self.goal[1]) <= GOAL_RADIUS
         reward += 1.0 if reached else STEP_REWARD
         info |= {"success": reached, "position": np.array([x, y])}
         return self._observation(), reward, reached, False, info
 
     def _move_point(self, forward, turn):
-        """Turn and move the point by its coordinates, step the physics, then mind the walls."""
-        x, y, heading = self._qpos[:3].tolist()
+        """Turns the point and moves it forward, steps the physics, then reflects it at walls."""
+        qpos, qvel = self.data.qpos, self.data.qvel
+        x, y, heading = qpos[:3].tolist()
         heading += turn
         if abs(heading) > math.pi:
             heading -= math.copysign(2 * math.pi, heading)
-        self._qpos[:3] = x + forward * math.cos(heading), y + forward * math.sin(heading), heading
-        np.clip(self._qvel, -POINT_MAX_VELOCITY, POINT_MAX_VELOCITY, out=self._qvel)
+        qpos[:3] = x + forward * math.cos(heading), y + forward * math.sin(heading), heading
+        np.clip(qvel, -POINT_MAX_VELOCITY, POINT_MAX_VELOCITY, out=qvel)
         mujoco.mj_step(self.model, self.data)
-        self._qpos[:2] = self.reflect((x, y), tuple(self._qpos[:2].tolist()))
+        qpos[:2] = reflect(self.faces, (x, y), tuple(qpos[:2].tolist()))
 
     def _observation(self):
-        nq, nv = self.nq, self.nv
-        if self._block_pos.size:  # mj_step leaves them where the integrator's last stage had them
+        qpos, nq, step = self.data.qpos, self.nq, [0.001 * self._steps]
+        parts = [qpos[:nq], self.data.qvel[: self.nv], step]
+        if self.n_blocks:
+            # After mj_step the bodies are where the last stage of the integrator had them
             mujoco.mj_kinematics(self.model, self.data)
-        parts = (
-            self._qpos[:3],
-            self._block_pos,
-            self._qpos[3:nq],
-            self._qvel[:nv],
-            (0.001 * self._steps,),
-        )
+            parts[:1] = qpos[:3], self.data.xpos[-self.n_blocks :].reshape(-1), qpos[3:nq]
         return np.concatenate(parts)
 
     def render(self):
@@ -391,9 +353,6 @@ class MazeEnv(gym.Env):
             return None
         if self._renderer is None:
             self._renderer = mujoco.Renderer(self.model, 480, 480)
-            weakref.finalize(
-                self, self._renderer.close
-            )  # at exit at the latest, while OpenGL still works
             xy = np.array([(x, y) for _, x, y in self.cells])
             self._camera = mujoco.MjvCamera()
             self._camera.lookat = [*(xy.min(0) + xy.max(0)) / 2, 0]
@@ -404,7 +363,6 @@ class MazeEnv(gym.Env):
         return self._renderer.render()
 
     def close(self):
-        """Free the renderer."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -1,0 +1,230 @@
+"""Statistics of runs: means and their intervals, tests, contrasts. Draws and reads nothing.
+
+`runs` are as of `study.runs.select`: a row per run.
+"""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+
+def standardize(runs):
+    """Performance of the runs, standardized over all of them in the same environment: a Series.
+
+    Sec. "Evaluation Details": "results are grouped by environment and standardized to zero mean and
+    unit variance to control for the impact of the environments. We combine these standardized
+    results by averaging across different environments and seeds." In an environment without
+    variance all are 0.
+    """
+
+    def z(x):
+        return (x - x.mean()) / x.std(ddof=0) if np.ptp(x) > 0 else 0 * x
+
+    return runs.groupby("environment").performance.transform(z)
+
+
+def mean_interval(values, n_resamples=9999):
+    """Mean over the first axis, its 95 % BCa bootstrap interval as in all the paper's figures.
+
+    values: (runs,) or (runs, steps). Returns mean, low, high. One run has no interval (NaN); of
+    equal values the interval is that value.
+    """
+    values = np.asarray(values, float)
+    mean = values.mean(axis=0)
+    low, high = np.array(mean), np.array(mean)
+    varies = np.ptp(values, axis=0) > 0  # BCa is not defined for equal values
+    if len(values) < 2:
+        low, high = low * np.nan, high * np.nan
+    elif varies.any():
+        how = {"n_resamples": n_resamples, "batch": 1000, "rng": np.random.default_rng(0)}
+        result = stats.bootstrap([values.T[varies]], np.mean, axis=-1, method="BCa", **how)
+        low[varies], high[varies] = result.confidence_interval
+    return mean, low, high
+
+
+def mean_intervals(runs, column, by):
+    """`mean_interval` of a column in each group of runs: a DataFrame of mean, low, high, runs."""
+    groups = runs.groupby(by)[column]
+    rows = [[*mean_interval(values), len(values)] for _, values in groups]
+    return pd.DataFrame(rows, groups.mean().index, columns=["mean", "low", "high", "runs"])
+
+
+def cells_interval(samples):
+    """Mean over cells of the mean over each cell's runs, with a 95 % BCa bootstrap interval.
+
+    The seeds are drawn within cells: environments and n_envs are the study's choice, not chance.
+    Each cell weighs the same, however many seeds it has. Drawing n of n seeds makes the variance of
+    their mean too small, by (n - 1) / n; they are spread by the root of its inverse (as Rao and Wu
+    1988), since cells of two or three seeds would have half of it.
+
+    samples: arrays (runs,), one per cell. Returns mean, low, high; NaN where a cell has one run,
+    whose scatter is not known.
+    """
+
+    def mean(*cells, axis=-1):
+        return np.mean([np.mean(cell, axis=axis) for cell in cells], axis=0)
+
+    samples = [np.asarray(cell, float) for cell in samples]
+    center = mean(*samples)
+    if min(map(len, samples)) < 2:
+        return center, np.nan, np.nan
+    if not any(np.ptp(cell) > 0 for cell in samples):
+        return center, center, center
+    samples = [x.mean() + (x - x.mean()) * (len(x) / (len(x) - 1)) ** 0.5 for x in samples]
+    how = {"n_resamples": 9999, "batch": 500, "rng": np.random.default_rng(0), "vectorized": True}
+    return center, *stats.bootstrap(samples, mean, method="BCa", **how).confidence_interval
+
+
+def cells_intervals(runs, column, by, cells):
+    """`cells_interval` in each group of runs: a DataFrame of mean, low, high, number of runs."""
+    rows = {}
+    for value, group in runs.groupby(by):
+        samples = [values for _, values in group.groupby(cells)[column]]
+        rows[value] = [*cells_interval(samples), len(group)]
+    table = pd.DataFrame.from_dict(rows, "index", columns=["mean", "low", "high", "runs"])
+    return table.rename_axis(by)
+
+
+def weighted(x, weights=None):
+    """Mean, standard deviation and size of a sample, (runs,) or (samples, runs), for `welch`.
+
+    A weighted sample counts as 1 / sum(weights^2) runs (Kish).
+    """
+    x = np.asarray(x, float)
+    w = np.ones(x.shape[-1]) if weights is None else np.asarray(weights, float)
+    w = w / w.sum()
+    mean, squares = x @ w, (w**2).sum()
+    variance = (x - mean[..., None]) ** 2 @ w / (1 - squares)
+    return mean, variance**0.5, 1 / squares
+
+
+def welch(a, b, weights_a=None, weights_b=None):
+    """p-value of Welch's t-test (Table 1), of weighted means where there are weights.
+
+    NaN with fewer than two runs on a side, 1 where all values are the same.
+    """
+    if min(len(a), len(b)) < 2:
+        return np.nan
+    if np.ptp([*a, *b]) == 0:
+        return 1.0
+    sides = [*weighted(a, weights_a), *weighted(b, weights_b)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # scipy's, about values nearly the same
+        return stats.ttest_ind_from_stats(*sides, equal_var=False).pvalue
+
+
+# --- Robust statistics, for few seeds (Agarwal et al. 2021) ---------------------------------------
+
+
+def iqm(*cells, axis=-1):
+    """Interquartile mean: the mean without the lowest and the highest quarter.
+
+    cells: arrays (..., runs). Each cell weighs the same, however many runs it has.
+    """
+    z = np.concatenate(cells, axis=-1)
+    weights = np.repeat([1 / x.shape[-1] for x in cells], [x.shape[-1] for x in cells])
+    order = z.argsort(axis=-1)
+    places = np.cumsum(weights[order], axis=-1) / len(cells)
+    kept = np.diff(np.clip(places, 0.25, 0.75), prepend=0.25, axis=-1)
+    return 2 * (kept * np.take_along_axis(z, order, axis=-1)).sum(-1)
+
+
+def improvement(*cells, axis=-1):
+    """Probability that a run of one kind is better than one of another, averaged over cells.
+
+    Mann-Whitney's statistic: a tie is half an improvement. cells: arrays (..., runs), first each
+    cell's runs of the one kind, then, in the same order, those of the other.
+    """
+    pairs = zip(cells[: len(cells) // 2], cells[len(cells) // 2 :], strict=True)
+    signs = [np.sign(x[..., :, None] - y[..., None, :]).mean((-2, -1)) for x, y in pairs]
+    return 0.5 + 0.5 * np.mean(signs, axis=0)
+
+
+def stratified(samples, statistic):
+    """Value and 95 % percentile bootstrap interval of statistic(*samples), drawn within samples.
+
+    NaN for all without samples, for the interval where one of them has a single run.
+    """
+    if not samples:
+        return np.nan, np.nan, np.nan
+    if min(map(len, samples)) < 2:
+        return statistic(*samples), np.nan, np.nan
+    how = {"n_resamples": 2000, "batch": 200, "rng": np.random.default_rng(0)}
+    how |= {"method": "percentile", "vectorized": True}
+    return statistic(*samples), *stats.bootstrap(samples, statistic, **how).confidence_interval
+
+
+# --- Contrasts: weighted sums of means, and how far chance may move them --------------------------
+
+
+def summed(variances, df):
+    """Standard error and degrees of freedom (Satterthwaite) of a sum of independent estimates."""
+    total, squares = variances.sum(), (variances**2 / df).sum()
+    return {"se": total**0.5, "df": total**2 / squares if squares != 0 else np.inf}
+
+
+def same_cells(index, of):
+    """Cells such that each environment is averaged over the same values of the second level.
+
+    These values are the ones that half of `of` environments have (else, that most have); the
+    environments are those with all of these. index: MultiIndex, environment and the second level.
+    Returns its part, and the values.
+    """
+    environment, second = (index.get_level_values(level) for level in (0, 1))
+    shared = second.value_counts()
+    shared = shared.index[shared >= min(of / 2, shared.max())]
+    index, environment = index[second.isin(shared)], environment[second.isin(shared)]
+    return index[(environment.value_counts()[environment] == len(shared)).to_numpy()], shared
+
+
+def contrast(runs, weights, by, cells=("environment",), of=16):
+    """A weighted sum of groups' means of `z`, averaged over cells and environments, and its error.
+
+    In each cell with all groups: the sum of weight times mean over seeds; only where each has two
+    seeds, if such cells are there; with a second column of cells, those of `same_cells`. Then over
+    environments: their E are taken for a sample of `of`, the seeds for a sample of each (Cochran,
+    Sampling Techniques, Sec. 10.3): with f = E / of the variance is (1 - f) s^2 / E between
+    environments + f / E times the mean variance by seeds. So 16 of 16 are the study itself, where
+    only seeds are chance.
+
+    weights: {value of the column `by`: weight}. cells: columns, `environment` first, and at most
+    one more.
+
+    Returns a dict: environments, and where there are any: mean; se, NaN where a group has one seed;
+    df; made_of, in words; enough: whether it is of half of the environments, and of three values of
+    the second column of cells, if any.
+    """
+    weight = pd.Series(weights, dtype=float)
+    groups = runs[runs[by].isin(list(weights))].groupby([*cells, by]).z
+    if groups.ngroups == 0:
+        return {"environments": 0}
+    tables = groups.mean(), groups.var(), groups.size()
+    tables = [table.unstack(by).reindex(columns=weight.index) for table in tables]
+    there, two = tables[0].notna().all(axis=1), tables[1].notna().all(axis=1)
+    chosen = tables[0].index[two if two.any() else there]
+    enough, made_of = True, ""
+    if len(cells) > 1:
+        chosen, shared = same_cells(chosen, of)
+        enough = len(shared) >= 3
+        made_of = f", {cells[1]} {', '.join(f'{value:g}' for value in sorted(shared))}"
+    mean, variance, seeds = (table.loc[chosen] for table in tables)
+    if mean.empty:
+        return {"environments": 0}
+    environments = mean.index.get_level_values("environment")
+    by_environment = (mean * weight).sum(axis=1).groupby(environments).mean()
+    n = len(by_environment)
+    f = min(n / of, 1)
+    within = f * (variance * weight**2 / seeds).to_numpy() / len(mean) ** 2
+    between = (1 - f) * by_environment.var() / n if f < 1 else 0.0
+    each_df = np.append((seeds - 1).clip(lower=1), max(n - 1, 1))
+    found = {"mean": by_environment.mean()} | summed(np.append(within, between), each_df)
+    found |= {"environments": n, "enough": bool(enough and n >= of / 2)}
+    return found | {"made_of": f"{n} environment{'s'[: n > 1]}{made_of}"}
+
+
+def interval(found, alpha=0.05):
+    """Low and high end of the 1 - alpha interval of a `contrast`; NaN where it has none."""
+    half = stats.t.ppf(1 - alpha / 2, found["df"]) * found["se"] if found["se"] else 0.0
+    return found["mean"] - half, found["mean"] + half

@@ -1,0 +1,804 @@
+"""The script: against Stable-Baselines3, as a user runs it, and as a student edits it."""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+import types
+
+import filelock
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
+
+import ppo_colored_continuous as ppo
+from colored_noise import ColoredNoiseProcess, projected_beta
+
+SCRIPT = ppo.__file__
+N_STEPS, N_ENVS = 64, 3
+
+# --- Same weights and data as Stable-Baselines3, same numbers out
+
+
+class Drift(gym.Env):
+    """A point pushed by two actions; an episode ends far away, or at a time limit of 20 steps."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = gym.spaces.Box(np.array([-1, -0.5], np.float32), np.array([1, 0.5], np.float32))
+
+    def reset(self, seed=None, options=None):
+        self.x, self.t = np.zeros(2, np.float32), 0
+        return self._obs(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)  # actions arrive clipped
+        self.x, self.t = self.x + action, self.t + 1
+        reward = float(self.x.sum() + 0.1 * self.t)
+        return self._obs(), reward, bool(abs(self.x).max() > 3), False, {}
+
+    def _obs(self):
+        return np.array([*self.x, 0.1 * self.t], np.float32)
+
+
+gym.register("Drift-v0", Drift, max_episode_steps=20)
+
+
+def parse(flags=""):
+    return ppo.parse_args(flags.split())
+
+
+def layers(agent):
+    nets = ("actor_mean", "critic")
+    return {f"{net}.{i}": getattr(agent, net)[i] for net in nets for i in (0, 2, 4)}
+
+
+def sb3_layers(policy):
+    actor, critic = policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net
+    theirs = [*actor[::2], policy.action_net, *critic[::2], policy.value_net]
+    return dict(zip(layers(ppo.Agent(1, 1)), theirs, strict=True))
+
+
+def copy_weights(agent, policy):
+    for name, layer in sb3_layers(policy).items():
+        layer.load_state_dict(layers(agent)[name].state_dict())
+    policy.log_std.data.copy_(agent.log_std.data)
+
+
+def drift_envs():
+    return DummyVecEnv([lambda: gym.make("Drift-v0")] * N_ENVS)
+
+
+def make_pair(flags="", **sb3_settings):
+    """Our agent and SB3's PPO with the same random weights, not the initial ones; our arguments."""
+    args = parse(flags)
+    settings = dict(learning_rate=args.learning_rate, n_steps=N_STEPS, n_epochs=1)
+    settings |= dict(batch_size=N_STEPS * N_ENVS, seed=1)
+    sb3 = PPO("MlpPolicy", drift_envs(), **{**settings, **sb3_settings})
+    torch.manual_seed(0)
+    agent = ppo.Agent(3, 2)
+    for p in agent.parameters():
+        p.data += 0.1 * torch.randn_like(p)
+    copy_weights(agent, sb3.policy)
+    return agent, sb3, args
+
+
+def random_minibatch(agent, n=N_STEPS * N_ENVS):
+    torch.manual_seed(2)
+    obs, actions = torch.randn(n, 3), torch.randn(n, 2)
+    with torch.no_grad():  # the noise: so that a good part of the ratios is clipped
+        logprobs = agent(obs, actions)[0] + 0.3 * torch.randn(n)
+    return obs, actions, logprobs, 2 * torch.randn(n) + 1, 3 * torch.randn(n), torch.randn(n)
+
+
+def fill_buffer(sb3, minibatch):
+    """Puts a minibatch into SB3's rollout buffer in the same order, flattened already."""
+    buffer = sb3.rollout_buffer
+    buffer.reset()
+    obs, actions, logprobs, advantages, returns, _ = (x.numpy() for x in minibatch)
+    buffer.observations, buffer.actions, buffer.log_probs = obs, actions, logprobs[:, None]
+    buffer.advantages, buffer.returns = advantages[:, None], returns[:, None]
+    buffer.values = np.zeros_like(buffer.returns)
+    buffer.full = buffer.generator_ready = True
+    sb3._setup_learn(1)
+
+
+def flat(agent, policy, get=lambda p: p):
+    """SB3's parameters, or get(parameter) of each, in the order of ours."""
+    pairs = {
+        f"{name}.{k}": p
+        for name, layer in sb3_layers(policy).items()
+        for k, p in layer.named_parameters()
+    }
+    pairs["log_std"] = policy.log_std
+    parts = [get(pairs[name]).detach().reshape(-1) for name, _ in agent.named_parameters()]
+    return torch.cat(parts)
+
+
+def parameters(agent):
+    return nn.utils.parameters_to_vector(agent.parameters()).detach()
+
+
+def test_network_is_the_same():
+    agent, sb3, _ = make_pair()
+    obs, actions, *_ = random_minibatch(agent)
+    logprobs, entropy, values = agent(obs, actions)
+    their_values, their_logprobs, their_entropy = sb3.policy.evaluate_actions(obs, actions)
+    torch.testing.assert_close(values, their_values.squeeze(-1))
+    torch.testing.assert_close(logprobs, their_logprobs)
+    torch.testing.assert_close(entropy.expand(len(obs)), their_entropy)
+    mean = ppo.numpy_policy(agent.actor_mean)(obs.numpy())
+    their_mean = sb3.policy.get_distribution(obs).distribution.mean
+    torch.testing.assert_close(torch.tensor(mean), their_mean.detach())
+
+
+def test_initial_weights_have_the_same_law():
+    """Orthogonal with the gains of SB3, zero biases, log std 0."""
+    agent, sb3 = ppo.Agent(3, 2), PPO("MlpPolicy", gym.make("Drift-v0"), seed=1).policy
+    for name, theirs in sb3_layers(sb3).items():
+        ours = layers(agent)[name]
+        assert ours.weight.shape == theirs.weight.shape and not ours.bias.any()
+        pair = (torch.linalg.svdvals(layer.weight) for layer in (ours, theirs))
+        torch.testing.assert_close(*pair)
+    assert torch.equal(agent.log_std, sb3.log_std)
+
+
+@pytest.mark.parametrize(
+    "flags, settings",
+    [
+        ("--max-grad-norm 1e9", dict(max_grad_norm=1e9)),
+        ("", {}),
+        ("--no-normalize-advantage --ent-coef 0.03 --vf-coef 0.7 --clip-range 0.1",
+         dict(normalize_advantage=False, ent_coef=0.03, vf_coef=0.7, clip_range=0.1)),
+    ],
+)  # fmt: skip
+def test_loss_and_gradient(flags, settings):
+    agent, sb3, args = make_pair(flags, **settings)
+    minibatch = random_minibatch(agent)
+    loss, _ = ppo.ppo_loss(agent, minibatch, args)
+    grads, metrics = ppo.loss_gradients(ppo.ppo_loss, agent, minibatch, args)
+    fill_buffer(sb3, minibatch)
+    sb3.train()
+    logged = sb3.logger.name_to_value
+    assert loss.item() == pytest.approx(logged["train/loss"], rel=1e-4)
+    ours = {name: value.item() for name, value in metrics.items()}
+    assert ours["policy_loss"] == pytest.approx(logged["train/policy_gradient_loss"], abs=1e-5)
+    assert ours["value_loss"] == pytest.approx(logged["train/value_loss"], rel=1e-5)
+    assert -ours["entropy"] == pytest.approx(logged["train/entropy_loss"], rel=1e-5)
+    assert ours["approx_kl"] == pytest.approx(logged["train/approx_kl"], rel=1e-4)
+    assert ours["clip_fraction"] == pytest.approx(logged["train/clip_fraction"])
+    assert 0.2 < ours["clip_fraction"] < 0.8
+    theirs = flat(agent, sb3.policy, lambda p: p.grad)
+    ours = torch.cat([grad.reshape(-1) for grad in grads])
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("compile", [False, True])
+def test_parameters_after_steps_of_adam(compile, capsys):
+    """Five steps at falling rates, eager and compiled, the last of a smaller minibatch."""
+    agent, sb3, args = make_pair()
+    optimizer = ppo.make_optimizer(agent, args)
+    gradients = ppo.functools.partial(ppo.loss_gradients, ppo.ppo_loss)
+    gradients = ppo.compiled(gradients) if compile else gradients
+    minibatch, before = random_minibatch(agent), parameters(agent)
+    args.n_epochs, args.batch_size = 1, N_STEPS * N_ENVS
+    for rate, n in [(1e-3, 192), (8e-4, 192), (5e-4, 192), (2e-4, 192), (1e-4, 96)]:
+        part = tuple(x[:n] for x in minibatch)
+        fill_buffer(sb3, part)
+        sb3.rollout_buffer.buffer_size, sb3.rollout_buffer.n_envs = n, 1
+        sb3.lr_schedule = lambda _, rate=rate: rate
+        sb3.train()
+        optimizer.param_groups[0]["lr"] = rate
+        ppo.learn(agent, optimizer, part, gradients, args)
+    after = flat(agent, sb3.policy)
+    assert (after - before).abs().max() > 2e-3
+    torch.testing.assert_close(parameters(agent), after, rtol=1e-4, atol=2e-5)
+    assert "going on without" not in capsys.readouterr().err  # it did compile
+
+
+@pytest.mark.parametrize("gamma, gae_lambda", [(0.99, 0.95), (1.0, 0.0), (0.9, 1.0)])
+def test_gae_against_the_rollout_buffer(gamma, gae_lambda):
+    rng = np.random.default_rng(0)
+    rewards, values = rng.normal(size=(2, N_STEPS, N_ENVS)).astype(np.float32)
+    dones = rng.random((N_STEPS, N_ENVS)) < 0.1
+    last_values = rng.normal(size=N_ENVS).astype(np.float32)
+    space = gym.spaces.Box(-1, 1, (1,))
+    buffer = RolloutBuffer(N_STEPS, space, space, "cpu", gae_lambda, gamma, N_ENVS)
+    buffer.rewards, buffer.values = rewards.copy(), values.copy()
+    buffer.episode_starts = np.concatenate([np.ones((1, N_ENVS)), dones[:-1]])
+    buffer.compute_returns_and_advantage(torch.tensor(last_values), dones[-1])
+    advantages, returns = ppo.compute_gae(rewards, values, dones, last_values, gamma, gae_lambda)
+    np.testing.assert_allclose(advantages, buffer.advantages, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(returns, buffer.returns, rtol=1e-4, atol=1e-5)
+
+
+class ColoredGaussian(DiagGaussianDistribution):
+    """SB3's distribution with colored noise, as the paper has it."""
+
+    def __init__(self, noise):
+        super().__init__(noise.size[1])
+        self.noise = noise
+
+    def sample(self):
+        return self.distribution.mean + self.distribution.stddev * self.noise.sample()
+
+
+@pytest.mark.parametrize("bootstrap", ["", "--no-bootstrap-timeouts"])
+def test_whole_rollout_against_sb3(monkeypatch, train, bootstrap):
+    """The script's batches, with colored noise, clipped actions, ends, time limits, are SB3's.
+
+    Three rollouts with the policy unchanged, so that noise and episodes run on across rollouts.
+    """
+    total, agents, batches = 3 * N_STEPS * N_ENVS, [], []
+    flags = f"--env-id Drift-v0 --n-steps {N_STEPS} --n-envs {N_ENVS} --total-timesteps {total} "
+    flags += f"--eval-freq {total} --eval-episodes 1 --no-compile --noise-seq-len 50 {bootstrap}"
+
+    def make_agent(*dims):
+        agents.append(ppo.Agent(*dims))
+        agents[0].critic[-1].bias.data += 5  # a value worth bootstrapping
+        return agents[0]
+
+    def learn(agent, optimizer, batch, *_):
+        batches.append([x.clone() for x in batch])
+        return {}
+
+    train(flags, make_agent=make_agent, learn=learn)
+    sb3 = PPO("MlpPolicy", drift_envs(), n_steps=N_STEPS, seed=1)
+    copy_weights(agents[0], sb3.policy)
+    noise = ColoredNoiseProcess(0.5, N_ENVS, 2, 50, ppo.make_seeds(2, 1, 0)[1])
+    sb3.policy.action_dist = ColoredGaussian(noise)
+    if bootstrap:  # the paper's dm_control runs did not see that an end was a time limit
+        step_wait = sb3.env.step_wait
+
+        def without_time_limits():
+            *rest, infos = step_wait()
+            for info in infos:
+                info.pop("TimeLimit.truncated", None)
+            return *rest, infos
+
+        monkeypatch.setattr(sb3.env, "step_wait", without_time_limits)
+    _, callback = sb3._setup_learn(10**6)
+    for batch in batches:
+        sb3.collect_rollouts(sb3.env, callback, sb3.rollout_buffer, N_STEPS)
+        buffer = sb3.rollout_buffer
+        assert buffer.episode_starts.sum() > N_ENVS
+        theirs = (buffer.observations, buffer.actions, buffer.log_probs, buffer.advantages)
+        for ours, their in zip(batch, (*theirs, buffer.returns, buffer.values), strict=True):
+            their = their.reshape(ours.shape)
+            np.testing.assert_allclose(ours.numpy(), their, rtol=1e-3, atol=1e-4)
+    assert len(batches) == 3
+
+
+# --- Environments and evaluation
+
+
+class Count(gym.Env):
+    """Observation and reward are the time t. Terminates after `seed` steps, 5 by default."""
+
+    observation_space = gym.spaces.Box(0, 10, (1,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, seed=None, options=None):
+        self.t, self.length = 0, seed or 5
+        return np.array([0.0]), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.array([float(self.t)]), float(self.t), self.t == self.length, False, {}
+
+
+gym.register("CountTerminated-v0", Count)
+gym.register("CountTruncated-v0", Count, max_episode_steps=5)
+
+
+@pytest.mark.parametrize("beside", [True, False])
+@pytest.mark.parametrize("env_id", ["CountTerminated-v0", "CountTruncated-v0"])
+def test_autoreset_inserts_no_dummy_transition(env_id, beside, monkeypatch):
+    if not beside:
+        monkeypatch.setattr(ppo, "study", None)
+    length = 10 if env_id == "CountTruncated-v0" else 5
+    envs = ppo.make_vector_env(parse(f"--env-id {env_id}"), 2)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    obs, _ = envs.reset(seed=[length, length])
+    assert obs.dtype == np.float32 and obs.shape == (2, 1)
+    seen, rewards = [obs[0, 0].item()], []
+    for _ in range(10):
+        envs.envs[0].unwrapped.length = length
+        obs, reward, terminated, truncated, infos = envs.step(np.zeros((2, 1), np.float32))
+        seen.append(obs[0, 0].item())
+        rewards.append(reward[0].item())
+        if terminated[0] or truncated[0]:
+            assert truncated[0] == (env_id == "CountTruncated-v0")
+            assert infos["final_obs"][0].tolist() == [5.0]  # what is bootstrapped
+    assert seen == [0, 1, 2, 3, 4, 0, 1, 2, 3, 4, 0]
+    assert rewards == [1, 2, 3, 4, 5] * 2
+
+
+def test_evaluation_counts_whole_episodes_once():
+    envs = ppo.make_vector_env(parse("--env-id CountTruncated-v0"), 3)
+    returns, lengths = ppo.evaluate(lambda obs: np.zeros((3, 1), np.float32), envs, [3, 10, 1])
+    assert returns.tolist() == [6, 15, 1] and lengths.tolist() == [3, 5, 1]
+
+
+def test_dict_observations_are_flattened_to_float32_in_order():
+    envs = ppo.make_vector_env(parse("--env-id dm_control/walker-run-v0 --no-envpool"), 1)
+    obs, _ = envs.reset(seed=[3])
+    raw = envs.envs[0].unwrapped._env.task.get_observation(envs.envs[0].unwrapped._env.physics)
+    expected = np.concatenate([np.ravel(raw[key]) for key in sorted(raw)])
+    assert obs.shape == (1, 24) and obs.dtype == np.float32
+    np.testing.assert_allclose(obs[0], expected, rtol=1e-6)
+
+
+class Draws(gym.Env):
+    """Draws from all generators that an environment may use, also when it is made."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+    def __init__(self):
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        self.made = np.random.normal() + random.random()  # noqa: NPY002
+
+    def reset(self, seed=None, options=None):
+        drawn = np.random.normal() + random.random() + torch.randn(()).item()  # noqa: NPY002
+        return np.float32([drawn + self.made + self.action_space.sample()[0]]), {}
+
+    def step(self, action):
+        obs, _ = self.reset()
+        return obs, obs[0].item(), False, False, {}
+
+
+gym.register("Draws-v0", Draws, max_episode_steps=10)
+
+
+def test_same_seed_same_evaluations_whatever_an_environment_draws_from(train, tiny):
+    def evaluations(flags):
+        random.seed(time.time())
+        np.random.seed(time.time_ns() % 2**32)  # noqa: NPY002
+        folder = train(f"{tiny} --env-id Draws-v0 --overwrite {flags}")
+        return (folder / "evaluations.csv").read_text()
+
+    first = evaluations("--seed 5")
+    assert first == evaluations("--seed 5") != evaluations("--seed 6")
+    white = evaluations("--vanilla --beta 0")
+    assert white == evaluations("--vanilla --beta 2")
+
+
+# --- The script as a user runs it
+
+
+def assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=0):
+    steps = [row["step"] for row in read_evaluations(folder)]
+    assert steps == list(range(512, 4097, 512))
+    events = read_events(folder)
+    assert [step for step, _ in events["evaluation/return_mean"]] == steps
+    lost = set(steps) - {step for step, _ in events["losses/policy_loss"]}
+    assert len(lost) <= restarts  # the last update before a restart is hidden
+    assert json.loads((folder / "summary.json").read_text())["steps"] == 4096
+    assert not list(folder.glob("*.tmp"))
+
+
+@pytest.mark.parametrize("beta, reached", [("0.5", True), ("0", False)])
+def test_mountain_car_needs_colored_noise(train, beta, reached):
+    """With a larger learning rate than the paper's, 90 is passed after about 90,000 steps."""
+    flags = "--learning-rate 1e-3 --total-timesteps 98304 --eval-freq 8192 --eval-episodes 10"
+    summary = json.loads((train(f"{flags} --beta {beta}") / "summary.json").read_text())
+    assert summary["final_return"] > 90 if reached else summary["final_return"] < 1
+
+
+def test_files_of_a_run(train, tiny, tmp_path, read_evaluations, read_events, capsys):
+    folder = train(f"{tiny} --beta 0.25 --seed 3 --exp-name test")
+    path = "runs/test/MountainCarContinuous-v0/beta_0.25/n_envs_2/seed_3"
+    assert folder == tmp_path / path
+    assert_complete_tiny_run(folder, read_evaluations, read_events)
+    config = json.loads((folder / "config.json").read_text())
+    assert config["args"]["beta"] == [0.25] and config["versions"]["torch"].startswith("2.13.0")
+    rows, summary = read_evaluations(folder), json.loads((folder / "summary.json").read_text())
+    assert summary["performance"] == pytest.approx(np.mean([row["return_mean"] for row in rows]))
+    assert summary["final_return"] == rows[-1]["return_mean"] and summary["wall_seconds"] > 0
+    assert all(row["length_mean"] == 999 for row in rows)
+    best = torch.load(folder / "best.pt", weights_only=True)
+    returns = {row["step"]: row["return_mean"] for row in rows}
+    assert best["return_mean"] == pytest.approx(max(returns.values()))
+    assert returns[best["step"]] == pytest.approx(best["return_mean"])
+    assert str(folder) in capsys.readouterr().out
+
+
+def test_evaluations_fall_on_their_steps_whatever_the_update_size(
+    train, read_evaluations, read_events
+):
+    """More steps per update than between evaluations, and a total that is no multiple of either."""
+    flags = "--total-timesteps 5000 --n-envs 3 --n-steps 500 --eval-freq 600 --eval-episodes 2 "
+    folder = train(f"{flags} --n-epochs 1 --no-compile --env-id Pendulum-v1 --batch-size 1000")
+    assert [row["step"] for row in read_evaluations(folder)] == list(range(600, 5000, 600))
+    losses = read_events(folder)["losses/value_loss"]
+    assert [step for step, _ in losses] == [1500, 3000, 4500, 6000]
+
+
+@pytest.mark.parametrize("beta", ["0.5", "0.5 1 0 0.2 -1 2"])
+def test_dm_control_and_one_beta_per_action_dimension(train, read_evaluations, beta):
+    flags = "--total-timesteps 512 --n-steps 256 --n-envs 1 --eval-freq 256 --eval-episodes 1 "
+    flags += f"--n-epochs 1 --no-compile --no-envpool --beta {beta}"
+    folder = train(f"--env-id dm_control/cheetah-run-v0 {flags}")
+    assert [row["length_mean"] for row in read_evaluations(folder)] == [1000, 1000]
+    assert folder.parts[-3] == "beta_" + beta.replace(" ", "_")
+
+
+def test_beta_auto(train, tiny):
+    folder = train(f"{tiny} --beta auto")
+    beta = json.loads((folder / "config.json").read_text())["args"]["beta"]
+    assert folder.parts[-3] == "beta_auto" and beta == [projected_beta(2, 256, 1000)]
+
+
+def wait_for_rows(folder, n, process):
+    """Waits until a run has made n evaluations."""
+    table = folder / "evaluations.csv"
+    while process.poll() is None and not (table.exists() and table.read_text().count("\n") > n):
+        time.sleep(0.01)
+
+
+def test_kill_at_any_moment_and_resume(start, train, tiny, read_evaluations, read_events):
+    """In the end everything is there once, and the noise went on where it was."""
+    rng, flags = random.Random(1), f"{tiny} --env-id Pendulum-v1 --resume"
+    args = parse(flags)
+    reached = 0
+    for kill_at in (2, 5):
+        process = start(flags)
+        args.runs_dir = process.args[-1]
+        folder = ppo.run_path(args)
+        wait_for_rows(folder, kill_at, process)
+        time.sleep(rng.random() * 0.2)
+        process.kill()
+        process.communicate()
+        checkpoint = folder / "checkpoint.pt"
+        if checkpoint.exists():
+            step = torch.load(checkpoint, weights_only=True)["global_step"]
+            assert step >= reached
+            reached = step
+    assert train(flags) == folder
+    assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=2)
+    final = torch.load(folder / "checkpoint.pt", weights_only=True)
+    # steps of Adam: 8 updates of 512 / 128 minibatches; noise: 8 x 256 steps of sequences of 1000
+    assert final["optimizer"]["state"][0]["step"].item() == 8 * 4
+    assert final["noise"]["index"] == 8 * 256 - 2 * 1000
+
+
+def interrupted(train, flags, n):
+    """Runs until the update n + 1 and stops in it, with a checkpoint of each update."""
+    calls = []
+
+    def learn(agent, *rest):
+        if len(calls) == n:
+            raise KeyboardInterrupt
+        calls.append(agent)
+        return ppo.learn(agent, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        ticks = iter(range(10**6, 10**9, 10))  # ten seconds later at each look
+        patch.setattr(ppo, "time", types.SimpleNamespace(time=ticks.__next__))
+        with pytest.raises(KeyboardInterrupt):
+            train(flags, learn=learn)
+    return calls[-1]
+
+
+def test_resume_goes_on_from_the_checkpoint(train, tiny, tmp_path, read_evaluations, read_events):
+    """Earlier evaluations stay, bit for bit, and the policy is the one that was saved."""
+    tiny += " --env-id Pendulum-v1"
+    agent = interrupted(train, tiny, 5)
+    folder = next((tmp_path / "runs").rglob("config.json")).parent
+    before, first = (folder / "evaluations.csv").read_text(), []
+    assert before.count("\n") == 6
+
+    def learn(agent, *rest):
+        first.append(parameters(agent))
+        return ppo.learn(agent, *rest)
+
+    with pytest.raises(FileExistsError, match="--resume continues it, --overwrite starts again"):
+        train(tiny)
+    with pytest.raises(FileExistsError, match="gamma 0.99, not 0.9: choose another --exp-name"):
+        train(f"{tiny} --gamma 0.9 --resume")
+    train(f"{tiny} --resume", learn=learn)
+    assert torch.equal(first[0], parameters(agent)) and len(first) == 3
+    assert (folder / "evaluations.csv").read_text().startswith(before)
+    assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=1)
+
+
+def test_a_finished_run_is_not_run_again(train, tiny, capsys):
+    folder = train(tiny)
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir() if path.name != "lock"}
+    capsys.readouterr()
+    assert train(f"{tiny} --resume") == folder
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert capsys.readouterr().out.startswith("nothing was run")
+
+
+def test_overwrite_starts_again(train, tiny, read_evaluations, read_events):
+    folder = train(f"{tiny} --seed 2")
+    first = (folder / "evaluations.csv").read_text()
+    assert train(f"{tiny} --seed 2 --overwrite --gamma 0.9") == folder
+    assert (folder / "evaluations.csv").read_text() != first
+    assert_complete_tiny_run(folder, read_evaluations, read_events)
+
+
+def test_a_second_process_is_kept_out_and_the_lock_goes_with_the_run(start, train, tiny):
+    args = parse(tiny)
+    process = start(tiny)
+    args.runs_dir = process.args[-1]
+    process.kill()
+    process.communicate()
+    path = ppo.run_path(args)
+    path.mkdir(parents=True, exist_ok=True)
+    with filelock.FileLock(path / "lock"), pytest.raises(SystemExit) as ended:
+        train(tiny)
+    assert ended.value.code == 3
+    with pytest.raises(KeyboardInterrupt):  # in a notebook, say
+        train(tiny, learn=interrupt)
+    assert train(f"{tiny} --overwrite") == path
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    "flags, words",
+    [
+        ("--n-envs 0", "must be positive"),
+        ("--n-envs many", "invalid int value"),
+        ("--beta 0.5 auto", "auto is one value"),
+        ("--resume --overwrite", "choose one"),
+        ("--n-envs 64 --total-timesteps 100000", "first update, after 64 * 2048 steps"),
+        ("--env-kwargs goal=3", "env-kwargs"),
+    ],
+)
+def test_a_wrong_flag_is_told_by_argparse(flags, words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(flags)
+    assert ended.value.code == 2 and words in capsys.readouterr().err
+
+
+class Faulty(Drift):
+    """What its argument names is not finite from the step 300 on."""
+
+    steps = 0
+
+    def __init__(self, what):
+        self.what = what
+
+    def step(self, action):
+        obs, reward, *rest = super().step(np.zeros(2, np.float32))
+        Faulty.steps += 1
+        broken = Faulty.steps >= 300
+        obs = obs * np.nan if broken and self.what == "observations" else obs
+        return obs, np.inf if broken and self.what == "rewards" else reward, *rest
+
+
+gym.register("Faulty-v0", Faulty, max_episode_steps=20)
+
+
+@pytest.mark.parametrize("what", ["observations", "rewards"])
+def test_what_is_not_finite_is_named(train, tiny, what, monkeypatch):
+    monkeypatch.setattr(Faulty, "steps", 0)
+    message = f"{what} (nan|inf).* in environment 1 of Faulty-v0"
+    with pytest.raises(FloatingPointError, match=message if what == "rewards" else what):
+        train(
+            f"{tiny} --env-id Faulty-v0 --env-kwargs {json.dumps({'what': what})}".replace(
+                ": ", ":"
+            )
+        )
+
+
+def test_a_diverged_run_says_so(train, tiny):
+    with pytest.raises(FloatingPointError, match="diverged: lower --learning-rate"):
+        train(f"{tiny} --learning-rate 1e30")
+
+
+def test_discrete_actions_are_refused(train, tiny):
+    with pytest.raises(TypeError, match="CartPole-v1 has actions Discrete"):
+        train(f"{tiny} --env-id CartPole-v1")
+
+
+MODULE = """import gymnasium as gym
+import numpy as np
+
+class MyEnv(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 1.0, False, False, {}
+
+gym.register("MyEnv-v0", MyEnv, max_episode_steps=7)
+"""
+
+
+def test_two_files_alone(tmp_path, tiny, read_evaluations):
+    """In an empty folder: Gymnasium's, dm_control's and one's own tasks; kill and --resume."""
+    for name in ("ppo_colored_continuous.py", "colored_noise.py"):
+        shutil.copy(ppo.Path(SCRIPT).with_name(name), tmp_path)
+    (tmp_path / "my_env.py").write_text(MODULE)
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    how = {"cwd": tmp_path, "env": env, "capture_output": True, "text": True}
+
+    def run(flags):
+        command = [sys.executable, "ppo_colored_continuous.py", *tiny.split(), *flags.split()]
+        return subprocess.run(command, **how)
+
+    for env_id in ("Pendulum-v1", "dm_control/pendulum-swingup-v0", "my_env:MyEnv-v0"):
+        done = run(f"--env-id {env_id} --eval-episodes 1")
+        assert done.returncode == 0, done.stderr
+        folder = (
+            tmp_path / "runs/ppo_colored_continuous" / env_id.replace("/", "_").replace(":", "_")
+        )
+        folder = folder / "beta_0.5/n_envs_2/seed_1"
+        assert len(read_evaluations(folder)) == 8
+    assert run("--normalize-obs").returncode == 2 and run("--envpool").returncode == 2
+    assert "PointUMaze" in run("--env-id PointUMaze-v1").stderr.splitlines()[-1]
+    (folder / "summary.json").unlink()
+    done = run(f"--env-id {env_id} --eval-episodes 1 --resume")
+    assert done.returncode == 0 and (folder / "summary.json").exists(), done.stderr
+
+
+def test_without_a_compiler_it_says_so_once_and_goes_on(start, tiny, tmp_path):
+    process = start(tiny.replace("--no-compile", ""), env={**os.environ, "CXX": "none",
+                    "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache")})  # fmt: skip
+    _, err = process.communicate()
+    assert process.returncode == 0 and err.count("going on without torch.compile") == 1
+
+
+# --- Edits that students make, each in a copy of the script: they take effect, or fail loudly
+
+LOOP = "            act = exploration(agent, noise, args)\n"
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_a_learning_rate_and_a_clip_range_set_in_the_loop(run_edited, flags):
+    rate = '            optimizer.param_groups[0]["lr"] = 1e-2 * (1 - global_step / total)\n'
+    agent, scalars, _ = run_edited((LOOP, LOOP + rate), flags=flags)
+    constant, *_ = run_edited(flags=flags)
+    annealed, *_ = run_edited(flags=f"{flags} --anneal-lr")
+    assert torch.equal(parameters(agent), parameters(annealed))
+    assert (parameters(agent) - parameters(constant)).abs().max() > 1e-3
+    np.testing.assert_allclose(scalars["losses/learning_rate"], [1e-2, 7.5e-3, 5e-3, 2.5e-3])
+    clip = "            args.clip_range = 0.0 if global_step else 0.2\n"
+    clipped, scalars, _ = run_edited((LOOP, LOOP + clip), flags=flags)
+    assert scalars["losses/clip_fraction"][0] < 0.5 < min(scalars["losses/clip_fraction"][1:])
+
+
+HIDDEN = """            layer_init(nn.Linear(64, 64)),
+            nn.Tanh(),
+"""
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        ("nn.Tanh()", "nn.ReLU()"),
+        (HIDDEN, HIDDEN + HIDDEN),
+        (HIDDEN, f"            nn.LayerNorm(64),\n{HIDDEN}"),
+        ("nn.Tanh()", "nn.GELU()"),
+    ],
+    ids=["ReLU", "third hidden layer", "LayerNorm", "GELU"],
+)
+def test_layers(run_edited, edit):
+    """What is evaluated and acts is the module that learns."""
+    agent, scalars, module = run_edited(edit)
+    original, others, _ = run_edited()
+
+    def mean_action(obs):
+        return agent.actor_mean(torch.tensor(obs)).detach().numpy()
+
+    envs = module.make_vector_env(parse("--env-id Pendulum-v1"), 2)
+    returns, _ = module.evaluate(mean_action, envs, ppo.make_seeds(2, 1, 2, 2048))
+    assert returns.mean() == pytest.approx(scalars["evaluation/return_mean"][-1], rel=1e-3)
+    assert returns.mean() != pytest.approx(others["evaluation/return_mean"][-1], rel=1e-3)
+
+
+LOG_STD = "self.log_std = nn.Parameter(torch.zeros(action_dim))"
+
+
+def test_frozen_and_shared_parameters(run_edited):
+    frozen = LOG_STD[:-1] + ", requires_grad=False)"
+    agent, scalars, _ = run_edited((LOG_STD, frozen), flags="")
+    assert scalars["losses/std"] == [1.0] * 4 and agent.log_std.item() == 0
+    trunk = f"{LOG_STD}\n        self.critic[0] = self.actor_mean[0]"
+    agent, scalars, _ = run_edited((LOG_STD, trunk), flags="")
+    assert (
+        agent.critic[0] is agent.actor_mean[0] and np.isfinite(scalars["losses/value_loss"]).all()
+    )
+    tied = f"{LOG_STD}\n        self.critic[0].weight = self.actor_mean[0].weight"
+    agent, *_ = run_edited((LOG_STD, tied), flags="")
+    assert agent.critic[0].weight is agent.actor_mean[0].weight
+
+
+def test_another_optimizer(run_edited):
+    agent, *_ = run_edited()
+    decayed, *_ = run_edited(("torch.optim.Adam(trainable(agent)",
+                              "torch.optim.AdamW(trainable(agent), weight_decay=10.0"))  # fmt: skip
+    assert parameters(decayed).norm() < 0.6 * parameters(agent).norm()
+
+
+def test_an_agent_changed_in_the_loop_acts(run_edited):
+    """Its mean and its std: the actions are those that the log-probabilities are of."""
+    change = (
+        "            agent.actor_mean[-1].bias.data += 1.7\n            agent.log_std.data -= 9\n"
+    )
+    batches = []
+
+    def learn(agent, optimizer, batch, *_):
+        batches.append((batch[1].clone(), agent.actor_mean(batch[0])))
+        return {}
+
+    run_edited((LOOP, change + LOOP), learn=learn)
+    for i, (actions, means) in enumerate(batches):
+        assert means.mean() > 1.5 * (i + 1)
+        torch.testing.assert_close(actions, means, atol=1e-3, rtol=0)
+
+
+def test_hooks_and_dropout_in_the_policy():
+    actor = nn.Sequential(nn.Linear(3, 64), nn.Dropout(), nn.Linear(64, 1))
+    policy, obs = ppo.numpy_policy(actor), np.ones((1, 3), np.float32)
+    assert policy(obs) == policy(obs) and actor.training
+    actor = nn.Sequential(nn.Linear(3, 1))
+    actor[0].register_forward_hook(lambda module, inputs, output: 0 * output + 1.5)
+    assert ppo.numpy_policy(actor)(obs) == 1.5
+
+
+AR1 = """def ar1(shape):
+    eps = torch.randn(shape)
+    for t in range(1, len(eps)):
+        eps[t] = 0.9 * eps[t - 1] + (1 - 0.9**2) ** 0.5 * eps[t]
+    return eps
+
+
+def exploration("""
+
+
+def test_another_noise(run_edited):
+    """AR(1), the discrete Ornstein-Uhlenbeck process, in place of 1/f noise."""
+    batches = []
+
+    def learn(agent, optimizer, batch, *_):
+        batches.append(batch[1].view(256, 2).clone())
+        return {}
+
+    edits = ("noise.sample(args.n_steps)", "ar1(shape)"), ("def exploration(", AR1)
+    run_edited(*edits, learn=learn)
+    actions = torch.cat(batches)
+    correlation = torch.corrcoef(torch.stack([actions[:-1, 0], actions[1:, 0]]))[0, 1]
+    assert correlation.item() == pytest.approx(0.9, abs=0.05)
+
+
+@pytest.mark.parametrize("flags", ["--no-compile", ""])
+def test_print_and_mistakes_in_the_loss(run_edited, capsys, flags):
+    line = "    ratio = log_ratio.exp()\n"
+    run_edited((line, f'{line}    print("ratio", ratio.mean())\n'), flags=flags)
+    out, err = capsys.readouterr()
+    assert out.count("ratio") >= 16  # 4 updates of 4 minibatches
+    assert ("going on without torch.compile" in err) == (flags == "")
+    with pytest.raises(AttributeError, match="expp"):
+        run_edited((line, line.replace("exp", "expp")), flags=flags)
+
+
+def test_an_edit_that_does_not_fit_the_checkpoint(run_edited, train, tiny, tmp_path):
+    """--resume says so, and loses nothing of the run that is there."""
+    flags = "--env-id Pendulum-v1 --total-timesteps 2048 --n-envs 2 --n-steps 256 --eval-freq 1024 "
+    flags += "--eval-episodes 2 --n-epochs 1 --learning-rate 1e-2 --no-compile"  # as run_edited has
+    interrupted(train, flags, 3)
+    folder = next((tmp_path / "runs").rglob("config.json")).parent
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+    edit = (HIDDEN, f"            nn.LayerNorm(64),\n{HIDDEN}")
+    with pytest.raises(RuntimeError, match="Missing key"):
+        run_edited(edit, again="--resume")
+    assert {name: (folder / name).read_bytes() for name in before} == before
