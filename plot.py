@@ -375,8 +375,8 @@ def transfer(runs):
     methods = [method for method in METHOD_LOOK if (runs.method == method).any()]
     need(set(methods) - {"ppo"}, "runs of TRPO or A2C with n_envs 4")
     groups = {name.upper(): runs[runs.method == name] for name in methods if name != "ppo"}
-    if len(methods) > 1:
-        shared = set.intersection(*(set(runs.beta[runs.method == name]) for name in methods))
+    shared = set.intersection(*(set(runs.beta[runs.method == name]) for name in methods))
+    if len(methods) > 1 and shared:
         groups["overall"] = same_protocol(runs[runs.beta.isin(shared)])
     for name, group in groups.items():
         groups[name] = standardized(group, ["method", "beta"], ["environment"])

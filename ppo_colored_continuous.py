@@ -7,30 +7,29 @@ Everything else is PPO as Stable-Baselines3 has it.
 
     python ppo_colored_continuous.py --env-id MountainCarContinuous-v0 --beta 0.5
 
-This file and colored_noise.py are all it takes (pip install torch gymnasium tensorboard tqdm
-filelock). If the folder study/ of the project is beside them, it adds faster environments, those
-of the paper and normalization. To change the method, edit this file. Its last function, main(),
-reads as the method does.
+It needs colored_noise.py and the packages imported below. Where the project's folder study/ is
+beside it, that adds faster environments, those of the paper, and normalization.
+To change the method, edit this file. main(), at its end, reads as the method does.
 """
 
 import argparse
-import ast
 import collections
 import contextlib
 import copy
+import functools
 import importlib.metadata
 import json
 import math
 import os
-import platform
 import random
 import re
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # for networks this small more threads are slower
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for these small networks more threads are slower
 
 import filelock
 import gymnasium as gym
@@ -38,62 +37,42 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from torch import nn
+from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from colored_noise import ColoredNoiseProcess, projected_beta
 
-try:  # adds EnvPool, threads, normalization and the paper's own environments
-    import study.environments as study
+try:
+    from study import environments as study  # EnvPool, threads, normalization, the paper's tasks
 except ModuleNotFoundError as error:
-    if error.name not in ("study", "study.environments"):
+    if error.name != "study":
         raise
     study = None
 
-sys.path.append(os.getcwd())  # for --env-id my_env:MyEnv-v0, with my_env.py in the current folder
-# Arguments that do not change the result: they may differ between a run and its --resume
-FREE_ARGUMENTS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "track"}
-
-
-def key_value(text):
-    """The pair (key, value) of "key=value"; the value is a Python literal, or else text."""
-    key, value = text.split("=", 1)
-    value = {"true": "True", "false": "False", "null": "None"}.get(value, value)
-    try:
-        return key, ast.literal_eval(value)
-    except (ValueError, SyntaxError):
-        return key, value
-
-
-def beta_or_auto(text):
-    return text if text == "auto" else float(text)
-
 
 def parse_args(argv=None, **defaults):
-    """Reads the command line, or the list argv. `defaults` take the place of those below."""
-    flag = argparse.BooleanOptionalAction
+    """Reads the command line, or the list argv; `defaults` replace those that stand here."""
+    flag, auto = argparse.BooleanOptionalAction, "auto"
     show_defaults = argparse.ArgumentDefaultsHelpFormatter
-    parser = argparse.ArgumentParser(
-        description="PPO with colored noise.", formatter_class=show_defaults, allow_abbrev=False
-    )
+    parser = argparse.ArgumentParser(formatter_class=show_defaults, allow_abbrev=False)
     add = parser.add_argument_group("experiment").add_argument
-    add("--env-id", default="MountainCarContinuous-v0", help="such as dm_control/walker-run-v0, or "
-        "my_env:MyEnv-v0, which my_env.py registers")  # fmt: skip
+    add("--env-id", default="MountainCarContinuous-v0", help="or dm_control/NAME-v0, MODULE:NAME")
     add("--seed", type=int, default=1, help="of everything random")
     add("--total-timesteps", type=int, default=2_048_000, help="of all environments together")
     add("--eval-freq", type=int, default=10_240, help="environment steps between evaluations")
     add("--eval-episodes", type=int, default=50, help="episodes per evaluation, in parallel")
-    add("--eval-once-per-policy", action=flag, default=False, help="evaluate each policy once; "
-        "further evaluations that are due before the next update repeat the result")  # fmt: skip
+    add("--eval-once-per-policy", action=flag, default=False, help="evaluate each policy once, and "
+        "repeat the result where several evaluations are due before an update")  # fmt: skip
     add = parser.add_argument_group("environment").add_argument
-    add("--env-kwargs", type=key_value, nargs="+", action="extend", help="its arguments, key=value")
+    add("--env-kwargs", type=json.loads, help="its keyword arguments, as in '{\"goal\": [3, 0]}'")
     add("--max-episode-steps", type=int, help="a time limit in place of the environment's own")
     add("--rescale-actions", action=flag, default=False, help="map [-1, 1] to the action bounds")
     add("--normalize-obs", action=flag, default=False, help="by their running mean and std")
     add("--normalize-rewards", action=flag, default=False, help="by the std of discounted returns")
     add = parser.add_argument_group("colored noise").add_argument
-    add("--beta", type=beta_or_auto, nargs="+", default=[0.5], help="0 white, 1 pink, 2 red noise; "
-        "one number, or one per action dimension; auto: by the size of a batch")  # fmt: skip
+    add("--beta", type=lambda text: text if text == auto else float(text), nargs="+", default=[0.5],
+        help="0 white, 1 pink, 2 red; one per action dimension; auto: by the batch")  # fmt: skip
     add("--noise-seq-len", type=int, default=1000, help="T, steps until sequences are drawn anew")
     add("--vanilla", action="store_true", help="white noise from torch, as in ordinary PPO")
     add = parser.add_argument_group("PPO").add_argument
@@ -113,40 +92,38 @@ def parse_args(argv=None, **defaults):
     add("--bootstrap-timeouts", action=flag, default=True, help="add gamma * V(obs) at time limits")
     add = parser.add_argument_group("running").add_argument
     add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
-    add("--threads", type=int, default=os.cpu_count(), help="that step environments, if study/ is "
-        "there and they gain by it")  # fmt: skip
-    add("--compile", action=flag, default=True, help="compile the update")
+    add("--threads", type=int, default=os.cpu_count(), help="that step environments; needs study/")
+    add("--compile", action=flag, help="compile the loss and its gradients, which takes 10 to 40 "
+        "seconds; by default in runs of 100,000 steps and more")  # fmt: skip
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
     add("--exp-name", default="ppo_colored_continuous", help="the experiment, a folder's name")
     add("--runs-dir", default="runs", help="folder of all runs")
     add("--resume", action="store_true", help="continue the run from its last checkpoint")
     add("--overwrite", action="store_true", help="start again where the folder holds a run")
     add("--track", action="store_true", help="log to Weights & Biases too (pip install wandb)")
-    parser.set_defaults(**{"method": "ppo", **defaults})  # study/methods.py has others
+    parser.set_defaults(**{"method": "ppo", **defaults})  # other methods: study/methods.py
     args = parser.parse_args(argv)
 
-    counts = ["total_timesteps", "eval_freq", "eval_episodes", "n_envs", "n_steps", "batch_size"]
-    for name in [*counts, "n_epochs", "threads"]:
-        if getattr(args, name) < 1:
-            parser.error(f"--{name.replace('_', '-')} must be at least 1")
+    counts = args.total_timesteps, args.eval_freq, args.eval_episodes
+    if min(*counts, args.n_envs, args.n_steps, args.batch_size) < 1:
+        parser.error("numbers of steps, episodes and environments must be positive")
     last_evaluation = args.total_timesteps // args.eval_freq * args.eval_freq
-    if args.n_envs * args.n_steps > max(last_evaluation, 0):
-        parser.error(f"the last evaluation, at step {last_evaluation}, would come before the first "
-                     f"update, which takes n_envs * n_steps = {args.n_envs * args.n_steps} steps: "
-                     "lower --n-steps, or raise --total-timesteps")  # fmt: skip
+    if last_evaluation < args.n_envs * args.n_steps:
+        parser.error(f"the first update, after {args.n_envs} * {args.n_steps} steps, comes after "
+                     f"the last evaluation, at {last_evaluation}: lower --n-steps")  # fmt: skip
     if args.resume and args.overwrite:
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
-    args.env_kwargs = dict(args.env_kwargs) if args.env_kwargs else None
-    args.beta_auto = args.beta == ["auto"]
-    if args.beta_auto:
-        args.beta = [projected_beta(args.n_envs, args.n_steps, args.noise_seq_len)]
-    elif "auto" in args.beta:
-        parser.error("--beta auto is one number for all action dimensions")
     if study is None and (args.envpool or args.normalize_obs or args.normalize_rewards):
-        parser.error("--envpool and --normalize-... need the project's folder study/ beside "
-                     "this script")  # fmt: skip
+        parser.error("--envpool and --normalize-* need the folder study/ beside this script")
     if args.envpool is None:
         args.envpool = study is not None and study.envpool_suits(args)
+    if args.compile is None:
+        args.compile = args.total_timesteps >= 100_000
+    args.beta_auto = args.beta == [auto]
+    if args.beta_auto:
+        args.beta = [projected_beta(args.n_envs, args.n_steps, args.noise_seq_len)]
+    elif auto in args.beta:
+        parser.error("--beta auto is one value for all action dimensions")
     return args
 
 
@@ -160,10 +137,7 @@ def layer_init(layer, gain=2**0.5):
 
 
 class Agent(nn.Module):
-    """Separate actor and critic, and a log std that is the same in all states.
-
-    Any layers but BatchNorm will do. Parameters with requires_grad=False are not learned.
-    """
+    """Separate actor and critic. Any layers but BatchNorm will do; frozen ones are not learned."""
 
     def __init__(self, obs_dim, action_dim):
         super().__init__()
@@ -183,6 +157,9 @@ class Agent(nn.Module):
         )
         self.log_std = nn.Parameter(torch.zeros(action_dim))
 
+    def std(self):
+        return self.log_std.exp()  # (action_dim,), the same in all states
+
     def forward(self, obs, actions):
         """obs (batch, obs_dim), actions (batch, action_dim).
 
@@ -190,37 +167,35 @@ class Agent(nn.Module):
         """
         # The density of a single step. That eps is correlated over time does not enter: each eps is
         # still Gaussian by itself, and PPO's objective is made of single steps (docs/lesson.md).
-        z = (actions - self.actor_mean(obs)) / self.log_std.exp()
-        logprobs = (-0.5 * z**2 - self.log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
-        entropy = (0.5 + 0.5 * math.log(2 * math.pi) + self.log_std).sum()
+        policy = Normal(self.actor_mean(obs), self.std(), validate_args=False)
+        logprobs, entropy = policy.log_prob(actions).sum(-1), policy.entropy().sum(-1).mean()
         return logprobs, entropy, self.critic(obs).squeeze(-1)
 
 
 def numpy_policy(actor):
     """The module `actor` as a function from numpy to numpy: obs (n, obs_dim) -> (n, action_dim).
 
-    The networks are so small that calling torch takes longer than computing: 31 us for 4 rows,
-    numpy 6. Layers that are known here are computed in numpy; with any other the module is called,
-    in eval mode. The weights are copied: make it anew when the module has learned.
+    For networks this small numpy is quicker than torch: 6 us for 4 rows, not 31. It is used if all
+    layers are known here; otherwise the module is called, in eval mode. Either way the weights are
+    copied, so make the function anew when the module has learned.
     """
-    activations = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0), nn.Identity: lambda x: x}
-    modules = [actor, *actor] if type(actor) is nn.Sequential else [actor]
+    known = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
+    hooks = any(m._forward_hooks or m._forward_pre_hooks for m in actor.modules())
     functions = []
-    for layer in modules[1:]:
-        if type(layer) is nn.Linear and layer.bias is not None:
+    for layer in actor if type(actor) is nn.Sequential and not hooks else [actor]:
+        if type(layer) is nn.Linear and layer.bias is not None and not hooks:
             weight, bias = (p.detach().cpu().numpy().T.copy() for p in (layer.weight, layer.bias))
             functions.append(lambda x, weight=weight, bias=bias: x @ weight + bias)
-        elif type(layer) in activations:
-            functions.append(activations[type(layer)])
-    hooks = any(module._forward_hooks or module._forward_pre_hooks for module in modules)
-    if hooks or len(functions) != len(modules) - 1 or len(modules) == 1:
-        module, device = copy.deepcopy(actor).eval(), next(actor.parameters()).device
-        return lambda obs: module(torch.as_tensor(obs, device=device)).detach().cpu().numpy()
+        elif type(layer) in known:
+            functions.append(known[type(layer)])
+        else:
+            module, device = copy.deepcopy(actor).eval(), next(actor.parameters()).device
+            return lambda obs: module(torch.as_tensor(obs, device=device)).detach().cpu().numpy()
 
-    def policy(obs):
+    def policy(x):
         for function in functions:
-            obs = function(obs)
-        return obs
+            x = function(x)
+        return x
 
     return policy
 
@@ -229,20 +204,16 @@ def numpy_policy(actor):
 
 
 class FlatEnv(gym.Wrapper):
-    """Makes observations one float32 vector (a Dict in its order of keys), and actions one, too.
+    """Makes observations one float32 vector (a Dict in its order of keys), and actions one, too."""
 
-    With `rescale`, actions in [-1, 1] stand for those between the action bounds.
-    """
-
-    def __init__(self, env, rescale):
+    def __init__(self, env, rescale_actions):
         super().__init__(env)
         self._space, actions = float32_space(env.observation_space), env.action_space
         self.observation_space = spaces.Box(-np.inf, np.inf, (spaces.flatdim(self._space),))
-        low, high, dtype = actions.low.reshape(-1), actions.high.reshape(-1), actions.dtype
-        self._bounds = (low, high) if rescale else None
-        if rescale:
-            low, high = np.full_like(low, -1), np.full_like(high, 1)
-        self.action_space = spaces.Box(low, high, dtype=dtype)
+        self._low, self._high = actions.low.reshape(-1), actions.high.reshape(-1)
+        self._rescale = rescale_actions
+        low, high = (-1, 1) if rescale_actions else (self._low, self._high)
+        self.action_space = spaces.Box(low, high, self._low.shape, actions.dtype)
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:  # some environments draw from their spaces
@@ -252,22 +223,21 @@ class FlatEnv(gym.Wrapper):
         return spaces.flatten(self._space, obs), {}
 
     def step(self, action):
-        if self._bounds:
-            low, high = self._bounds
-            action = np.clip(low + (action + 1) / 2 * (high - low), low, high).astype(low.dtype)
-        action = action.reshape(self.env.action_space.shape)
+        if self._rescale:
+            action = self._low + (action + 1) / 2 * (self._high - self._low)
+            action = np.clip(action, self._low, self._high)  # of rounding
+        action = action.astype(self._low.dtype).reshape(self.env.action_space.shape)
         obs, reward, terminated, truncated, _ = self.env.step(action)
         return spaces.flatten(self._space, obs), reward, terminated, truncated, {}
 
 
 def float32_space(space):
-    """The space with each Box in float32: spaces.flatten casts observations to the space's type."""
+    """The space with float32 in each Box: spaces.flatten casts observations to the space's type."""
     if isinstance(space, spaces.Dict):
-        return spaces.Dict(
-            collections.OrderedDict((key, float32_space(x)) for key, x in space.items())
-        )
+        pairs = [(key, float32_space(part)) for key, part in space.items()]
+        return spaces.Dict(collections.OrderedDict(pairs))
     if isinstance(space, spaces.Tuple):
-        return spaces.Tuple([float32_space(x) for x in space])
+        return spaces.Tuple([float32_space(part) for part in space])
     return spaces.Box(-np.inf, np.inf, space.shape) if isinstance(space, spaces.Box) else space
 
 
@@ -276,23 +246,25 @@ def make_env(args, render_mode=None):
 
     This is the place for a wrapper of yours. EnvPool's are not made here: --no-envpool.
     """
-    kwargs = dict(args.env_kwargs or {})
+    kwargs = dict(args.env_kwargs or {}) | ({"render_mode": render_mode} if render_mode else {})
     if args.env_id.startswith("dm_control/"):
         import shimmy  # noqa: F401  registers dm_control's ids
 
-        if args.max_episode_steps:  # the task's own limit, in seconds, is inside of it
+        if args.max_episode_steps:  # the task's own limit, in seconds, is inside of this one
             kwargs["task_kwargs"] = {"time_limit": math.inf} | kwargs.get("task_kwargs", {})
-    if render_mode:
-        kwargs["render_mode"] = render_mode
-    # Gymnasium's checks of the first steps are for who writes an environment; they take time
-    env = gym.make(args.env_id, args.max_episode_steps, disable_env_checker=True, **kwargs)
-    actions, observations = env.action_space, env.observation_space
+    module, _, name = args.env_id.rpartition(":")
+    if module:  # my_env:MyEnv-v0, registered by my_env.py in the current folder, or installed
+        sys.path.append(os.getcwd())
+        file = importlib.import_module(module).__file__
+        if name not in gym.registry:
+            raise LookupError(f"the module {module}, which is {file}, registers no {name}")
+    # Gymnasium's checks of the first steps are for who writes an environment, and take time
+    env = gym.make(name, args.max_episode_steps, disable_env_checker=True, **kwargs)
+    actions = env.action_space
     if not isinstance(actions, spaces.Box) or not np.issubdtype(actions.dtype, np.floating):
-        raise TypeError(f"{args.env_id} has actions {actions}: colored noise needs real numbers")
-    if not observations.is_np_flattenable:
-        raise TypeError(f"{args.env_id} has observations {observations} of no fixed size")
+        raise TypeError(f"{args.env_id} has actions {actions}; colored noise needs real numbers")
     if args.rescale_actions and not actions.is_bounded():
-        raise TypeError(f"--rescale-actions needs bounds, {args.env_id} has {actions}")
+        raise ValueError(f"--rescale-actions needs bounds, {args.env_id} has {actions}")
     return FlatEnv(env, args.rescale_actions)
 
 
@@ -306,18 +278,8 @@ def make_vector_env(args, n_envs):
         return study.EnvPoolVectorEnv(args, n_envs)
     if study:
         return study.make_vector_env(args, n_envs, make_env)
-    functions = [lambda: make_env(args)] * n_envs
-    same_step = gym.vector.AutoresetMode.SAME_STEP
-    return gym.vector.SyncVectorEnv(functions, copy=False, autoreset_mode=same_step)
-
-
-def make_envs(args):
-    """Returns the environments to train in and those to evaluate in, normalized as args say."""
-    envs, eval_envs = make_vector_env(args, args.n_envs), make_vector_env(args, args.eval_episodes)
-    if args.normalize_obs or args.normalize_rewards:
-        envs = study.NormalizedVectorEnv(envs, args)
-        eval_envs = envs.frozen(eval_envs)
-    return envs, eval_envs
+    functions, mode = [lambda: make_env(args)] * n_envs, gym.vector.AutoresetMode.SAME_STEP
+    return gym.vector.SyncVectorEnv(functions, copy=False, autoreset_mode=mode)
 
 
 # --- Collecting
@@ -327,10 +289,10 @@ def exploration(agent, noise, args):
     """Returns act(obs (n_envs, obs_dim), t) -> actions (n_envs, action_dim), for one rollout.
 
     Another object can take the noise's place. It needs sample(n_steps), a tensor (n_steps, n_envs,
-    action_dim) in which each value by itself is Gaussian with mean 0 and variance 1, and
-    state_dict() and load_state_dict(state), for checkpoints.
+    action_dim) in which each value by itself is Gaussian with mean 0 and variance 1, and, for
+    checkpoints, state_dict() and load_state_dict(state).
     """
-    mean, std = numpy_policy(agent.actor_mean), agent.log_std.exp().detach().cpu().numpy()
+    mean, std = numpy_policy(agent.actor_mean), agent.std().detach().cpu().numpy()
     shape = (args.n_steps, args.n_envs, len(std))
     # These lines are the paper: noise that is correlated over time, in place of white noise (Eq. 2)
     eps = (torch.randn(shape) if args.vanilla else noise.sample(args.n_steps)).numpy()
@@ -338,17 +300,19 @@ def exploration(agent, noise, args):
 
 
 @torch.no_grad()
-def collect(agent, act, envs, storage, args, bar):
-    """Takes n_steps in each environment, going on from the last obs, and makes a batch of them.
+def collect(agent, act, envs, last_obs, so_far, args, bar):
+    """Takes n_steps in each environment, going on from last_obs, and makes a batch of them.
 
-    storage: arrays obs (n_steps + 1, n_envs, obs_dim), actions (n_steps, n_envs, action_dim),
-    rewards and dones (n_steps, n_envs), and so_far (2, n_envs), return and length up to now of each
-    environment's episode. Returns the batch, (obs, actions, logprobs, advantages, returns, values),
-    each of n_steps * n_envs rows, and the (return, length) of every episode that ended.
+    last_obs: (n_envs, obs_dim). so_far: (2, n_envs), return and length up to now of each
+    environment's episode; it is updated. Returns the batch, (obs, actions, logprobs, advantages,
+    returns, values), each of n_steps * n_envs rows; the new last_obs; and the (return, length) of
+    every episode that ended.
     """
-    obs, actions, rewards, dones, so_far = storage
-    space, timeouts, episodes = envs.single_action_space, [], []
-    obs[0] = obs[-1]  # the observation after the last rollout's last step
+    space, shape, timeouts, episodes = envs.single_action_space, (args.n_steps, args.n_envs), [], []
+    obs = np.zeros((args.n_steps + 1, *last_obs.shape), np.float32)
+    actions = np.zeros((*shape, *space.shape), np.float32)
+    rewards, dones = np.zeros(shape, np.float32), np.zeros(shape, bool)
+    obs[0] = last_obs
     for t in range(args.n_steps):
         actions[t] = act(obs[t], t)
         # The environment gets the clipped action. The one stored, to learn from, is the unclipped:
@@ -364,19 +328,19 @@ def collect(agent, act, envs, storage, args, bar):
             if not terminated[i]:
                 timeouts.append((t, i, infos["final_obs"][i]))
         bar.update(args.n_envs)
-    for name, array in {"observation": obs, "action": actions, "reward": rewards}.items():
+    for name, array in {"observations": obs, "actions": actions, "rewards": rewards}.items():
         if not np.isfinite(array).all():
             t, i, *_ = np.argwhere(~np.isfinite(array))[0]
-            raise FloatingPointError(f"{name} {array[t, i]} in {args.env_id}, environment {i}, "
-                f"{args.n_steps - t} steps before step {bar.n // args.n_envs} of it")  # fmt: skip
+            raise FloatingPointError(f"{name} {array[t, i]} in environment {i} of {args.env_id}, "
+                                     f"{args.n_steps - t} steps before step {bar.n}")  # fmt: skip
 
     # Only the mean action is needed to act. The log-probabilities and values are computed here, for
     # all steps in one go: much quicker than one by one, and the same, as nothing has learned since.
     batch_obs = torch.as_tensor(obs[:-1], device=args.device).flatten(0, 1)
     batch_actions = torch.as_tensor(actions, device=args.device).flatten(0, 1)
     logprobs, _, values = agent(batch_obs, batch_actions)
-    last_obs = torch.as_tensor(obs[-1], device=args.device)
-    last_values = agent.critic(last_obs).squeeze(-1).cpu().numpy()
+    last_values = agent.critic(torch.as_tensor(obs[-1], device=args.device))
+    last_values = last_values.squeeze(-1).cpu().numpy()
     if args.bootstrap_timeouts and timeouts:
         # A time limit is not the end of the task: the episode would have gone on from its final
         # observation, and what would have followed is worth V(final observation).
@@ -386,7 +350,8 @@ def collect(agent, act, envs, storage, args, bar):
     values_2d = values.view(rewards.shape).cpu().numpy()
     targets = compute_gae(rewards, values_2d, dones, last_values, args.gamma, args.gae_lambda)
     advantages, returns = (torch.as_tensor(x, device=args.device).flatten() for x in targets)
-    return (batch_obs, batch_actions, logprobs, advantages, returns, values), episodes
+    batch = batch_obs, batch_actions, logprobs, advantages, returns, values
+    return batch, obs[-1], episodes
 
 
 def compute_gae(rewards, values, dones, last_values, gamma, gae_lambda):
@@ -409,26 +374,21 @@ def compute_gae(rewards, values, dones, last_values, gamma, gae_lambda):
 
 
 def trainable(agent):
-    """The parameters to learn, by name."""
-    return {name: p for name, p in agent.named_parameters() if p.requires_grad}
+    return [p for p in agent.parameters() if p.requires_grad]
 
 
-def unflatten(params, agent):
-    """Cuts the flat vector `params` into the agent's trainable parameters: {name: view}."""
-    named = trainable(agent)
-    pieces = params.split([p.numel() for p in named.values()])
-    return {name: x.view(named[name].shape) for name, x in zip(named, pieces, strict=True)}
+def make_optimizer(agent, args):
+    return torch.optim.Adam(trainable(agent), lr=args.learning_rate, eps=1e-5, fused=True)
 
 
-def ppo_loss(params, minibatch, agent, args):
-    """PPO's clipped objective (Schulman et al. 2017), as a function of the flat parameter vector.
+def ppo_loss(agent, minibatch, args):
+    """PPO's clipped objective (Schulman et al. 2017).
 
     minibatch: obs (batch, obs_dim), actions (batch, action_dim), logprobs, advantages, returns and
     values (batch,). Returns the loss and a dict of what is to be logged.
     """
-    obs, actions, old_logprobs, advantages, returns, _ = minibatch  # no clipping of values
-    named = unflatten(params, agent)
-    logprobs, entropy, values = torch.func.functional_call(agent, named, (obs, actions))
+    obs, actions, old_logprobs, advantages, returns, _ = minibatch  # old values: for value clipping
+    logprobs, entropy, values = agent(obs, actions)
     if args.normalize_advantage and len(advantages) > 1:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     log_ratio = logprobs - old_logprobs
@@ -444,94 +404,64 @@ def ppo_loss(params, minibatch, agent, args):
     return loss, metrics | {"approx_kl": approx_kl, "clip_fraction": clip_fraction}
 
 
-def adam(params, grads, optimizer, learning_rate):
-    """A step of Adam (Kingma & Ba 2015), with PyTorch's place for eps. Returns params, optimizer.
+def loss_gradients(loss_function, agent, minibatch, args):
+    """Gradients of the loss, scaled down to --max-grad-norm, and what is to be logged.
 
-    params, grads: flat vectors. optimizer: (exp_avg, exp_avg_sq, step), two vectors and a scalar.
+    This is loss.backward() and clip_grad_norm_(). In this form torch.compile makes one graph of
+    both and of the loss: a quarter of the time of ordinary PyTorch (--no-compile). What is not a
+    tensor is a constant of the graph. If it changes, the graph is compiled anew, which takes long.
     """
-    exp_avg, exp_avg_sq, step = optimizer
-    step = step + 1
-    exp_avg = 0.9 * exp_avg + 0.1 * grads
-    exp_avg_sq = 0.999 * exp_avg_sq + 0.001 * grads**2
-    denominator = (exp_avg_sq / (1 - 0.999**step)).sqrt() + 1e-5
-    params = params - learning_rate * (exp_avg / (1 - 0.9**step)) / denominator
-    return params, (exp_avg, exp_avg_sq, step)
+    loss, metrics = loss_function(agent, minibatch, args)
+    grads = torch.autograd.grad(loss, trainable(agent), materialize_grads=True)
+    norm = sum(grad.square().sum() for grad in grads).sqrt()
+    scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+    metrics = {name: value.detach() for name, value in metrics.items()}
+    return [grad * scale for grad in grads], metrics
 
 
-def ppo_update(params, optimizer, minibatch, learning_rate, agent, args):
-    """One minibatch's step. Returns params, optimizer and metrics; changes nothing in place.
-
-    What may change during training has to be an argument and a tensor: other values are constants
-    of the compiled graph, and new ones mean compiling anew. All parameters are one flat vector:
-    clipping and Adam then are a few operations in all, not a few for each of 13 parameters.
-    """
-    grads, metrics = torch.func.grad(ppo_loss, has_aux=True)(params, minibatch, agent, args)
-    grads = grads * (args.max_grad_norm / (grads.norm() + 1e-6)).clamp(max=1.0)
-    params, optimizer = adam(params, grads, optimizer, learning_rate)
-    return params, optimizer, metrics
-
-
-def compiled(update):
-    """torch.compile of an update as one graph, or, where that fails, the update as it is."""
-    # cpp_wrapper calls the kernels from C++ instead of Python: 13 % less time in an update
-    how = {"fullgraph": True, "dynamic": False, "options": {"cpp_wrapper": True}}
-    functions = [torch.compile(update, isolate_recompiles=True, **how)]
-
-    def call(*arguments):
-        try:
-            return functions[0](*arguments)
-        except Exception as error:  # no compiler, an edit that cannot be compiled, ...
-            if functions[0] is update:
-                raise
-            reason = str(error).strip().split("\n")[0][:120]
-            tqdm.write(f"note: going on without torch.compile, updates take 6 times as long "
-                       f"({reason})", file=sys.stderr)  # fmt: skip
-            functions[0] = update
-            return update(*arguments)
-
-    return call
-
-
-def learn(agent, optimizer, batch, learning_rate, update, args):
-    """Several epochs of minibatches; moves the agent's parameters.
-
-    Returns the optimizer's new state, and the metrics averaged over the minibatches.
-    """
-    params = nn.utils.parameters_to_vector(trainable(agent).values()).detach()
-    learning_rate = torch.tensor(learning_rate, dtype=torch.float64, device=args.device)
-    all_metrics = []
+def learn(agent, optimizer, batch, gradients, args):
+    """Several epochs of minibatches. Returns what is to be logged, averaged over minibatches."""
+    params, all_metrics = trainable(agent), []
     for _ in range(args.n_epochs):
         permutation = torch.randperm(len(batch[0])).to(args.device)
         shuffled = [x[permutation] for x in batch]
         for start in range(0, len(permutation), args.batch_size):
             minibatch = [x[start : start + args.batch_size] for x in shuffled]
-            params, optimizer, metrics = update(
-                params, optimizer, minibatch, learning_rate, agent, args
-            )
+            grads, metrics = gradients(agent, minibatch, args)
+            for parameter, grad in zip(params, grads, strict=True):
+                parameter.grad = grad
+            optimizer.step()
             all_metrics.append(metrics)
-    nn.utils.vector_to_parameters(params, trainable(agent).values())
-    means = {name: torch.stack([m[name] for m in all_metrics]).mean() for name in all_metrics[0]}
-    return optimizer, means
+    return {name: torch.stack([m[name] for m in all_metrics]).mean() for name in all_metrics[0]}
+
+
+def compiled(function):
+    """torch.compile of a function as one graph; where that fails, the function as it is."""
+    torch._dynamo.config.trace_autograd_ops = True  # autograd.grad inside of the graph
+    # cpp_wrapper: kernels are called from C++, not from Python
+    how = {"fullgraph": True, "dynamic": False, "options": {"cpp_wrapper": True}}
+    graph = torch.compile(function, isolate_recompiles=True, **how)
+
+    def call(*arguments):
+        nonlocal graph
+        try:
+            return graph(*arguments)
+        except Exception as error:  # no compiler, an edit that cannot be compiled, ...
+            if graph is function:
+                raise
+            graph, reason = function, str(error).strip().split("\n")[0][:120]
+            tqdm.write(f"note: going on without torch.compile, 4 times as slow in the update: "
+                       f"{reason}", file=sys.stderr)  # fmt: skip
+            return function(*arguments)
+
+    return call
 
 
 # --- Evaluating
 
 
-@contextlib.contextmanager
-def preserved_generators():
-    """What is drawn inside from the global generators is not missing from them afterwards."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
-
-
-@preserved_generators()  # evaluations must not change what training draws
-@torch.no_grad()
-def evaluate(policy, envs, seeds, max_steps=100_000):
+@torch.random.fork_rng(devices=[])  # an environment that draws from torch must not change training
+def evaluate(policy, envs, seeds, max_steps=1_000_000):
     """Plays one episode of the policy in each environment: returns and lengths, (n_envs,) each.
 
     Returns are undiscounted. An environment whose episode has ended steps on until the longest has:
@@ -555,23 +485,22 @@ def evaluate(policy, envs, seeds, max_steps=100_000):
 def evaluate_due(run, agent, envs, eval_envs, global_step, args, bar):
     """Makes the evaluations that are due before the next update.
 
-    The evaluation at step t is of the policy that acts at step t. With 8,192 steps per update and
-    an evaluation every 10,240, the policy learned up to step 8,192 acts until 16,383, so it is the
-    one evaluated for step 10,240.
+    An evaluation at step t is of the policy that acts at step t. With 8,192 steps per update, the
+    policy of step 8,192 acts until step 16,383, so it is the one evaluated for step 10,240.
     """
-    next_update = global_step + args.n_steps * args.n_envs
-    returns = None
+    policy, next_update = None, global_step + args.n_steps * args.n_envs
     while run.next_eval < next_update and run.next_eval <= args.total_timesteps:
-        if returns is None or not args.eval_once_per_policy:
+        if policy is None or not args.eval_once_per_policy:
             policy = numpy_policy(agent.actor_mean)
             seeds = make_seeds(args.eval_episodes, args.seed, 2, run.next_eval)
             returns, lengths = evaluate(policy, eval_envs, seeds)
         run.add_evaluation(returns, lengths, acting_state(agent, envs))
         bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
+        seed_global_generators(args.seed, 3, global_step)  # as if evaluations had drawn nothing
 
 
 def acting_state(agent, envs):
-    """All that a policy needs to act again: the networks, and statistics if it normalizes."""
+    """All that acts: the networks, and the statistics of --normalize-obs."""
     normalization = envs.state_dict() if hasattr(envs, "state_dict") else {}
     return {"agent": agent.state_dict(), "normalization": normalization}
 
@@ -595,8 +524,7 @@ def locked(path):
         with filelock.FileLock(path / "lock", timeout=0, fallback_to_soft=False):
             yield
     except filelock.Timeout:
-        print(f"another process works on {path}: wait for it, or choose another --seed or "
-              "--exp-name", file=sys.stderr)  # fmt: skip
+        print(f"another process works on {path}: choose another --seed or --exp-name")
         sys.exit(3)
 
 
@@ -611,6 +539,18 @@ def write_json(path, value):
     replace_file(path, lambda file: file.write_text(json.dumps(value, indent=2) + "\n"))
 
 
+def git_commit():
+    """Commit of this file, with "-dirty" where the checkout differs from it; None without git."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    with contextlib.suppress(OSError):
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+        return done.stdout.strip() or None
+
+
+# Arguments that do not change the result: they may differ between a run and its --resume
+FREE_ARGUMENTS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "track"}
+
+
 class Run:
     """The folder of a run: what it leaves behind, and what --resume goes on from.
 
@@ -619,93 +559,91 @@ class Run:
     """
 
     def __init__(self, args):
-        self.args, self.path = args, run_path(args)
-        self.checkpoint, self.next_eval, self.best = None, args.eval_freq, None
+        self.args, self.path, self.checkpoint = args, run_path(args), None
+        self.next_eval, self.best_return = args.eval_freq, -math.inf
         self.start_time, self.saved_time, self.logged_step = time.time(), 0.0, 0
         self.complete = (self.path / "summary.json").exists() and not args.overwrite
-        is_new = not any((self.path / name).exists() for name in ("config.json", "evaluations.csv"))
-        if is_new or args.overwrite:
-            return
-        old = json.loads((self.path / "config.json").read_text())["args"]
-        new = json.loads(json.dumps(vars(args)))
-        for name in sorted(new.keys() - FREE_ARGUMENTS):
-            if old.get(name) != new[name]:
-                flag = f"--{name.replace('_', '-')}"
-                raise FileExistsError(f"{self.path} holds a run with {flag} {old.get(name)}, not "
-                    f"{new[name]}: choose another --exp-name, or --overwrite it")  # fmt: skip
-        if not self.complete and not args.resume:
+        unfinished = (self.path / "checkpoint.pt").exists() and not (
+            args.overwrite or self.complete
+        )
+        if self.complete or unfinished:
+            old = json.loads((self.path / "config.json").read_text())["args"]
+            new = json.loads(json.dumps(vars(args)))
+            for name in sorted(new.keys() - FREE_ARGUMENTS):
+                if old.get(name) != new[name]:
+                    raise FileExistsError(f"{self.path} holds a run with {name} {old.get(name)}, "
+                        f"not {new[name]}: choose another --exp-name, or --overwrite")  # fmt: skip
+        if unfinished and not args.resume:
             raise FileExistsError(f"{self.path} holds an unfinished run: --resume continues it, "
                                   "--overwrite starts again")  # fmt: skip
-        if not self.complete and (self.path / "checkpoint.pt").exists():
+        if unfinished:
             self.checkpoint = torch.load(self.path / "checkpoint.pt", weights_only=True)
-            self.next_eval, self.best = self.checkpoint["next_eval"], self.checkpoint["best"]
-            self.start_time -= self.checkpoint["wall_seconds"]
 
-    def start(self, **resolved):
+    def start(self):
         """Cuts the files back to the checkpoint, or clears the folder; opens TensorBoard's file."""
-        table, step = self.path / "evaluations.csv", 0
+        rows, purge_step = ["step,return_mean,return_std,length_mean\n"], None
+        old_files = [*self.path.glob("*.tmp")]  # of a kill while one was written
         if self.checkpoint:
-            step = self.logged_step = self.checkpoint["global_step"]
-            n_rows = self.next_eval // self.args.eval_freq - 1
-            rows = table.read_text().splitlines(keepends=True)[: 1 + n_rows]
-            replace_file(table, lambda file: file.write_text("".join(rows)))
-            if self.best:
-                replace_file(self.path / "best.pt", lambda file: torch.save(self.best, file))
+            self.logged_step = self.checkpoint["global_step"]
+            self.next_eval = self.checkpoint["next_eval"]
+            self.best_return = self.checkpoint["best_return"]
+            self.start_time -= self.checkpoint["wall_seconds"]
+            purge_step = self.logged_step  # TensorBoard hides points from here on
+            rows = (self.path / "evaluations.csv").read_text().splitlines(keepends=True)
+            rows = rows[: self.next_eval // self.args.eval_freq]  # the first is the header
         else:
-            files = [self.path / name for name in ("summary.json", "checkpoint.pt", "best.pt")]
-            for file in [*files, *self.path.glob("events.out.tfevents.*")]:
-                file.unlink(missing_ok=True)
-            config = {"args": vars(self.args), "resolved": resolved, "versions": versions()}
-            write_json(self.path / "config.json", config | {"git_commit": git_commit()})
-            header = "step,return_mean,return_std,length_mean\n"
-            replace_file(table, lambda file: file.write_text(header))
+            names = ["summary.json", "checkpoint.pt", "best.pt"]
+            old_files += [self.path / name for name in names]
+            old_files += self.path.glob("events.out.tfevents.*")
+        for file in old_files:
+            file.unlink(missing_ok=True)
+        if not self.checkpoint:
+            versions = {x.name: x.version for x in importlib.metadata.distributions()}
+            config = {"args": vars(self.args), "git_commit": git_commit(), "versions": versions}
+            write_json(self.path / "config.json", config)
+        replace_file(self.path / "evaluations.csv", lambda file: file.write_text("".join(rows)))
         if self.args.track:
             import wandb
 
-            wandb.init(project="ppo_colored_noise", name=str(self.path), config=vars(self.args),
-                       sync_tensorboard=True)  # fmt: skip
-        # purge_step: TensorBoard hides what was logged after the checkpoint
-        self.writer = SummaryWriter(str(self.path), purge_step=step + 1 if step else None)
+            wandb.init(project="ppo_colored_noise", name=str(self.path), sync_tensorboard=True)
+        self.writer = SummaryWriter(str(self.path), purge_step=purge_step)
         self.log_time = time.time()
-
-    def log(self, step, scalars):
-        """Adds {tag: number} to TensorBoard."""
-        for tag, value in scalars.items():
-            self.writer.add_scalar(tag, value, step)
 
     def add_evaluation(self, returns, lengths, acting):
         """Writes a row of evaluations.csv, for the step next_eval. returns, lengths: (n_episodes,).
 
-        acting: state_dicts of all that acted. best.pt has those of the best mean return.
+        acting: the state_dicts of all that acted. best.pt keeps those of the best mean return.
         """
-        if not np.isfinite(returns).all():
-            raise FloatingPointError(f"returns {returns} in {self.args.env_id} at step "
-                                     f"{self.next_eval}: its rewards are not finite")  # fmt: skip
-        mean, std, length = returns.mean(), returns.std(), lengths.mean()
+        step, mean, std, length = self.next_eval, returns.mean(), returns.std(), lengths.mean()
+        if not np.isfinite(mean):
+            raise FloatingPointError(f"return {mean} in {self.args.env_id}, evaluated at {step}")
         with open(self.path / "evaluations.csv", "a") as file:
-            file.write(f"{self.next_eval},{mean:.9g},{std:.9g},{length:.9g}\n")
-        if self.best is None or mean > self.best["return_mean"]:
-            best = {**acting, "step": self.next_eval, "return_mean": mean.item()}
-            self.best = copy.deepcopy(best)
-            replace_file(self.path / "best.pt", lambda file: torch.save(self.best, file))
-        scalars = {"return_mean": mean, "return_std": std, "length_mean": length}
-        self.log(self.next_eval, {f"evaluation/{name}": x for name, x in scalars.items()})
+            file.write(f"{step},{mean:.9g},{std:.9g},{length:.9g}\n")
+        if mean > self.best_return:
+            self.best_return = mean.item()
+            best = {**acting, "step": step, "return_mean": self.best_return}
+            replace_file(self.path / "best.pt", lambda file: torch.save(best, file))
+        self.writer.add_scalar("evaluation/return_mean", mean, step)
+        self.writer.add_scalar("evaluation/return_std", std, step)
+        self.writer.add_scalar("evaluation/length_mean", length, step)
         self.next_eval += self.args.eval_freq
 
-    def log_update(self, step, metrics, episodes):
-        """Logs an update's metrics, the speed, and the means of episodes: (return, length) each."""
+    def add_update(self, step, losses, episodes):
+        """Logs an update: its losses, the speed, and the (return, length) means of episodes."""
+        scalars = {f"losses/{name}": float(value) for name, value in losses.items()}
         if episodes:
             means = np.mean(episodes, axis=0)
-            metrics |= {"rollout/return_mean": means[0], "rollout/length_mean": means[1]}
-        seconds, self.log_time = time.time() - self.log_time, time.time()
-        metrics["time/steps_per_second"] = (step - self.logged_step) / seconds
-        self.log(step, metrics)
-        self.logged_step = step
+            scalars |= {"rollout/return_mean": means[0], "rollout/length_mean": means[1]}
+        seconds = time.time() - self.log_time
+        scalars["time/steps_per_second"] = (step - self.logged_step) / seconds
+        for tag, value in scalars.items():
+            self.writer.add_scalar(tag, value, step)
+        self.logged_step, self.log_time = step, time.time()
 
     def save_checkpoint(self, **state):
         """Writes checkpoint.pt: tensors and plain values, all that --resume needs."""
         self.writer.flush()
-        state |= {"next_eval": self.next_eval, "best": self.best}
+        state |= {"next_eval": self.next_eval, "best_return": self.best_return}
         state["wall_seconds"] = time.time() - self.start_time
         replace_file(self.path / "checkpoint.pt", lambda file: torch.save(state, file))
         self.saved_time = time.time()
@@ -715,29 +653,11 @@ class Run:
         self.writer.close()
         rows = (self.path / "evaluations.csv").read_text().splitlines()[1:]
         returns = [float(row.split(",")[1]) for row in rows]
-        seconds = time.time() - self.start_time
-        summary = {"performance": sum(returns) / len(returns), "final_return": returns[-1],
-                   "steps": steps, "wall_seconds": round(seconds, 1)}  # fmt: skip
+        summary = {"performance": sum(returns) / len(returns), "final_return": returns[-1]}
+        summary |= {"steps": steps, "wall_seconds": round(time.time() - self.start_time, 1)}
         write_json(self.path / "summary.json", summary)
         print(f"performance {summary['performance']:.4g}, final return {returns[-1]:.4g}, "
-              f"{seconds / 60:.1f} min: {self.path}")  # fmt: skip
-
-
-def versions():
-    packages = ["torch", "numpy", "gymnasium", "mujoco", "dm-control", "shimmy"]
-    found = {"python": platform.python_version()}
-    for package in [*packages, "gymnasium-robotics", "envpool"]:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[package] = importlib.metadata.version(package)
-    return found
-
-
-def git_commit():
-    """Commit of this file, with "-dirty" where the checkout differs from it; None without git."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    how = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
-    with contextlib.suppress(OSError, subprocess.CalledProcessError):
-        return subprocess.run(command, **how).stdout.strip()
+              f"{summary['wall_seconds'] / 60:.1f} min: {self.path}")  # fmt: skip
 
 
 # --- The whole run
@@ -749,96 +669,88 @@ def make_seeds(n, *key):
 
 
 def seed_global_generators(*key):
-    """Some environments draw from these."""
+    """Seeds those of random and numpy, from which some environments draw."""
     seeds = make_seeds(2, *key)
     random.seed(seeds[0])
     np.random.seed(seeds[1])  # noqa: NPY002
 
 
-def main(args, make_agent=Agent, exploration=exploration, learn=learn, update=ppo_update):
+def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=learn,
+         make_optimizer=make_optimizer):  # fmt: skip
     """Trains and evaluates as `args` say. The other arguments are what another method replaces."""
     torch.set_num_threads(1)
     seed_global_generators(args.seed, 3, 0)  # before environments are made: some draw then
-    envs, eval_envs = make_envs(args)
+    envs, eval_envs = make_vector_env(args, args.n_envs), make_vector_env(args, args.eval_episodes)
+    if args.normalize_obs or args.normalize_rewards:
+        envs = study.NormalizedVectorEnv(envs, args)
+        eval_envs = envs.frozen(eval_envs)
     with contextlib.closing(envs), contextlib.closing(eval_envs), locked(run_path(args)):
         run = Run(args)
         if run.complete:
             print(f"nothing was run: {run.path} holds this run, complete. --overwrite runs it "
                   "again, --exp-name NAME keeps both")  # fmt: skip
             return
-        obs_dim, action_dim = (
-            math.prod(space.shape)
-            for space in (envs.single_observation_space, envs.single_action_space)
-        )
+        obs_dim = envs.single_observation_space.shape[0]
+        action_dim = envs.single_action_space.shape[0]
         init_seed, noise_seed = make_seeds(2, args.seed, 0)
         torch.manual_seed(init_seed)
         agent = make_agent(obs_dim, action_dim).to(args.device)
-        noise = ColoredNoiseProcess(
-            args.beta, args.n_envs, action_dim, args.noise_seq_len, noise_seed
-        )
-        params = nn.utils.parameters_to_vector(trainable(agent).values()).detach()
-        step = torch.zeros((), dtype=torch.float64, device=args.device)
-        optimizer = (torch.zeros_like(params), torch.zeros_like(params), step)
-        update = compiled(update) if args.compile else update
+        optimizer = make_optimizer(agent, args)
+        sizes = args.n_envs, action_dim, args.noise_seq_len
+        noise = ColoredNoiseProcess(args.beta, *sizes, noise_seed)
+        gradients = functools.partial(loss_gradients, loss)
+        gradients = compiled(gradients) if args.compile else gradients
 
         global_step = 0
         if run.checkpoint:
             global_step = run.checkpoint["global_step"]
             agent.load_state_dict(run.checkpoint["agent"])
-            if run.checkpoint["normalization"]:
-                envs.load_state_dict(run.checkpoint["normalization"])
-            optimizer = tuple(x.to(args.device) for x in run.checkpoint["optimizer"])
+            optimizer.load_state_dict(run.checkpoint["optimizer"])
             noise.load_state_dict(run.checkpoint["noise"])
             torch.set_rng_state(run.checkpoint["torch_rng"])
+            if run.checkpoint["normalization"]:
+                envs.load_state_dict(run.checkpoint["normalization"])
+        run.start()
         # The state of environments cannot be saved: after a resume they begin new episodes
         seed_global_generators(args.seed, 3, global_step)
-        shape = (args.n_steps, args.n_envs)
-        obs = np.zeros((args.n_steps + 1, args.n_envs, obs_dim), np.float32)
-        obs[-1], _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
-        actions = np.zeros((*shape, action_dim), np.float32)
-        rewards, dones = np.zeros(shape, np.float32), np.zeros(shape, bool)
-        storage = obs, actions, rewards, dones, np.zeros((2, args.n_envs))
+        obs, _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
         steps_per_update = args.n_steps * args.n_envs
         total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
-        episodes = []
+        episodes, so_far = [], np.zeros((2, args.n_envs))
 
-        run.start(obs_dim=obs_dim, action_dim=action_dim)
         where = "EnvPool's, not from make_env()" if args.envpool else "from make_env()"
         print(f"{run.path}: environments are {where}; after Ctrl-C, --resume goes on")
-        interval = 0.5 if sys.stderr.isatty() else 60
-        with tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True,
-                  mininterval=interval) as bar:  # fmt: skip
-            while True:
-                evaluate_due(run, agent, envs, eval_envs, global_step, args, bar)
-                if global_step == total:
-                    break
-                act = exploration(agent, noise, args)
-                batch, ended = collect(agent, act, envs, storage, args, bar)
-                learning_rate = args.learning_rate
-                if args.anneal_lr:
-                    learning_rate *= 1 - global_step / total
-                optimizer, metrics = learn(agent, optimizer, batch, learning_rate, update, args)
-                if not nn.utils.parameters_to_vector(agent.parameters()).isfinite().all():
-                    raise FloatingPointError("training diverged, parameters are not finite: lower "
-                                             "--learning-rate")  # fmt: skip
-                global_step += steps_per_update
+        bar = tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True,
+                   mininterval=0.5 if sys.stderr.isatty() else 60)  # fmt: skip
+        while True:
+            evaluate_due(run, agent, envs, eval_envs, global_step, args, bar)
+            if global_step == total:
+                break
+            if args.anneal_lr:
+                optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - global_step / total)
+            act = exploration(agent, noise, args)
+            batch, obs, ended = collect(agent, act, envs, obs, so_far, args, bar)
+            losses = learn(agent, optimizer, batch, gradients, args)
+            global_step += steps_per_update
+            if not nn.utils.parameters_to_vector(agent.parameters()).isfinite().all():
+                raise FloatingPointError("training diverged: lower --learning-rate")
 
-                episodes += ended
-                if (global_step - run.logged_step) * 1000 >= args.total_timesteps:
-                    *_, returns, values = batch
-                    unexplained = (returns - values).var() / returns.var().clamp(min=1e-12)
-                    metrics |= {"explained_variance": 1 - unexplained}
-                    metrics |= {"learning_rate": learning_rate}
-                    metrics = {f"losses/{name}": float(x) for name, x in metrics.items()}
-                    metrics["rollout/std"] = agent.log_std.exp().mean().item()
-                    run.log_update(global_step, metrics, episodes)
-                    episodes = []
-                if time.time() > run.saved_time + 5 or global_step == total:
-                    state = {"optimizer": optimizer, "noise": noise.state_dict()}
-                    state |= acting_state(agent, envs) | {"torch_rng": torch.get_rng_state()}
-                    run.save_checkpoint(global_step=global_step, **state)
+            episodes += ended
+            if (global_step - run.logged_step) * 1000 >= args.total_timesteps:  # 1000 points
+                *_, returns, values = batch
+                unexplained = (returns - values).var() / returns.var().clamp(min=1e-12)
+                losses |= {"explained_variance": 1 - unexplained, "std": agent.std().mean().item()}
+                losses["learning_rate"] = optimizer.param_groups[0]["lr"]
+                run.add_update(global_step, losses, episodes)
+                episodes = []
+            if time.time() > run.saved_time + 5 or global_step == total:
+                state = {"optimizer": optimizer.state_dict(), "noise": noise.state_dict()}
+                state |= acting_state(agent, envs) | {"torch_rng": torch.get_rng_state()}
+                run.save_checkpoint(global_step=global_step, **state)
+        bar.close()
         run.finish(global_step)
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program at once
     main(parse_args())

@@ -8,8 +8,9 @@ has in a sweep that keeps every core busy. They take turns: a round is one updat
 of each. The table has medians over rounds in microseconds per training step, evaluations weighted
 as in the protocol (one per 10,240 steps). The first round is not counted: torch.compile is in it.
 Start-up is the time until it begins. Policies are as they are after a few updates. "files" is
-logging, evaluations.csv and checkpoints. Bare physics is the simulator alone, called from Python:
-as many control steps as the protocol has, with random actions in training, none in evaluation.
+logging, evaluations.csv and a checkpoint (here in each round, in a run after 5 seconds). Bare
+physics is the simulator alone, called from Python: as many control steps as the protocol has, with
+random actions in training, none in evaluation.
 
 More tables: the training alone by number of environments; a run by number of threads, no longer
 held on one core; and the seconds that one waits before the first training step.

@@ -1,27 +1,27 @@
-"""What the project adds to the environments of ppo_colored_continuous.py.
+"""What the study adds to the environments of ppo_colored_continuous.py.
 
-The paper's own tasks (importing this file registers them: ten mazes and the Adroit door), EnvPool's
-C++ versions of ten tasks, and stepping by threads. The package behind an environment is imported
-when one is made.
+The paper's own tasks, ten mazes and the Adroit door (importing this file registers their ids);
+EnvPool's C++ versions of ten tasks; and threads that step environments. The package behind an
+environment is imported when one is made.
 """
 
 import contextlib
-import functools
 import importlib.util
 import io
+import logging
 import math
 import os
 import re
 import sys
 import tempfile
 import warnings
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from study.normalization import NormalizedVectorEnv  # noqa: F401  for the script
@@ -29,44 +29,26 @@ from study.protocol import NAMES
 
 # --- The mazes and the Adroit door
 
-for env_id in filter(re.compile("(Point|Ant|Swimmer).*-v1").fullmatch, NAMES):
-    robot, maze = re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id).groups()
-    gym.register(
-        env_id,
-        "study.mazes:MazeEnv",
-        kwargs={"robot": robot.lower(), "maze": maze},
-        max_episode_steps=1000,
-        reward_threshold=0.9,
-    )
+for env_id in NAMES:
+    if task := re.fullmatch("(Point|Ant|Swimmer)(.*)-v1", env_id):
+        kwargs = {"robot": task[1].lower(), "maze": task[2]}
+        limits = {"max_episode_steps": 1000, "reward_threshold": 0.9}
+        gym.register(env_id, "study.mazes:MazeEnv", kwargs=kwargs, **limits)
 gym.register("door-v0", "study.environments:make_door", max_episode_steps=200)
 
 
-def make_door(**kwargs):
-    """Makes D4RL's `door-v0` from gymnasium-robotics.
+def make_door(render_mode=None, **kwargs):
+    """Makes D4RL's `door-v0` from AdroitHandDoor-v1 of gymnasium-robotics; kwargs are its.
 
-    Takes the arguments of the package's AdroitHandDoorEnv but reward_type.
-    """
-    return door_class()(**kwargs)
-
-
-@functools.cache
-def door_class():
-    """The class of `door-v0`, inside a function since importing its base takes a second.
-
-    The package's AdroitHandDoor-v1 rewards the distance between palm and handle with +0.1 per m,
-    D4RL with -0.1.
+    That rewards the distance between palm and handle with +0.1 per m, D4RL with -0.1.
     """
     with contextlib.redirect_stderr(io.StringIO()):  # importing the package prints a notice
         from gymnasium_robotics.envs.adroit_hand.adroit_door import AdroitHandDoorEnv
     import mujoco
 
     class AdroitDoor(AdroitHandDoorEnv):
-        def __init__(self, render_mode=None, **kwargs):
-            self._visible = render_mode is not None
-            super().__init__(reward_type="dense", render_mode=render_mode, **kwargs)
-
         def _initialize_simulation(self):
-            if self._visible:
+            if render_mode is not None:
                 return super()._initialize_simulation()
             # Meshes and textures that are only seen take 6.7 of the model's 6.8 MB
             spec = mujoco.MjSpec.from_file(self.fullpath)
@@ -79,21 +61,37 @@ def door_class():
             palm_to_handle = math.hypot(*obs[-4:-1])
             return obs, reward - 0.2 * palm_to_handle, terminated, truncated, info
 
-    return AdroitDoor
+    return AdroitDoor(reward_type="dense", render_mode=render_mode, **kwargs)
 
 
-# --- Less memory
+# --- Pictures and messages
 
 
-def one_pixel_wide(xml):
-    return re.sub(rb'(width|height)="\d+"', rb'\1="1"', xml)
+def prepare_rendering():
+    """Lets MuJoCo and pygame render without a display; call it before the environment is made."""
+    displays = ("DISPLAY", "WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains without sound
+
+
+def quiet_packages():
+    """Keeps messages of installed packages off the terminal, but not a user's own warnings."""
+    gym.logger.min_level = gym.logger.ERROR
+    logging.getLogger("absl").setLevel(logging.ERROR)  # dm_control's
+    warnings.filterwarnings("ignore", module="glfw|torch.jit")  # no DISPLAY; deprecations
+    with contextlib.suppress(ImportError):
+        import mujoco
+
+        mujoco.set_mju_user_warning(lambda message: None)
 
 
 @contextlib.contextmanager
 def tiny_textures():
-    """Makes the sky and the floor of dm_control's suite one pixel wide, in models made meanwhile.
+    """Models of dm_control's suite that are made meanwhile have a sky and a floor of few pixels.
 
-    They take 12 MB of memory in each environment, and matter to pictures alone.
+    These take 12 MB of memory in each environment, and matter to pictures alone.
     """
     from dm_control.suite import common
 
@@ -106,26 +104,11 @@ def tiny_textures():
         common.ASSETS.update(assets)
 
 
-def quiet_packages():
-    """Keeps messages of installed packages off the terminal, but not a user's own warnings."""
-    gym.logger.min_level = gym.logger.ERROR
-    warnings.filterwarnings("ignore", module="glfw|torch.jit")  # no DISPLAY; deprecations
-    with contextlib.suppress(ImportError):
-        import mujoco
-
-        mujoco.set_mju_user_warning(lambda message: None)
+def one_pixel_wide(xml):
+    return re.sub(rb'(width|height)="\d+"', rb'\1="1"', xml)
 
 
-def prepare_rendering():
-    """Lets MuJoCo and pygame render without a display; call it before the environment is made."""
-    displays = ("DISPLAY", "WAYLAND_DISPLAY")
-    if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains without sound
-
-
-# --- Stepping by threads
+# --- Environments of Gymnasium, stepped by threads where that helps
 
 # Environments that share nothing, and whose step is mostly MuJoCo's, so that other threads of
 # Python run meanwhile. Measured with 50 environments, us a step with 1 and 2 threads: swimmer maze
@@ -137,10 +120,7 @@ GAIN_BY_THREADS |= {"dm_control/hopper-hop-v0", "dm_control/ball_in_cup-catch-v0
 
 
 def make_vector_env(args, n_envs, make_env):
-    """n_envs environments of make_env(args) that step together, with SAME_STEP autoreset.
-
-    Where that helps they are stepped by args.threads threads, with the same results.
-    """
+    """n_envs environments of make_env(args), with SAME_STEP autoreset, and threads if they help."""
     quiet_packages()
     is_suite = args.env_id.startswith("dm_control/")
     with tiny_textures() if is_suite else contextlib.nullcontext():
@@ -155,66 +135,30 @@ def sync_vector_env(envs):
     return SyncVectorEnv(functions, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
 
 
-class ThreadedVectorEnv(VectorEnv):
-    """Environments split among threads, each of which steps its part as a SyncVectorEnv.
+class ThreadedVectorEnv(VectorWrapper):
+    """A SyncVectorEnv, but for step, in which each of n_threads threads steps a part of it.
 
-    Results equal those of one SyncVectorEnv bit for bit, if the environments share no state. What
-    an environment raises comes through with its traceback.
+    Results are the same bit for bit, if the environments share no state.
     """
 
     def __init__(self, envs, n_threads):
-        self.envs, self.num_envs = envs, len(envs)
-        n_parts = min(n_threads, len(envs))
-        self._ends = [len(envs) * i // n_parts for i in range(n_parts + 1)]
-        self._parts = [sync_vector_env(envs[i:j]) for i, j in self._slices()]
-        self._pool = ThreadPoolExecutor(n_parts - 1)  # the caller's own thread steps the first part
-        self.metadata, self.render_mode = self._parts[0].metadata, envs[0].render_mode
-        self.single_observation_space = envs[0].observation_space
-        self.single_action_space = envs[0].action_space
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-
-    def _slices(self):
-        return zip(self._ends[:-1], self._ends[1:], strict=True)
-
-    def _split(self, values):
-        if len(values) != self.num_envs:
-            raise ValueError(f"{len(values)} values for {self.num_envs} environments")
-        return [values[i:j] for i, j in self._slices()]
-
-    def _each(self, calls):
-        futures = [self._pool.submit(call) for call in calls[1:]]
-        try:
-            first = calls[0]()
-        finally:
-            wait(futures)  # what comes next, be it an error, finds no environment in mid-step
-        return zip(first, *(future.result() for future in futures), strict=True)
-
-    def reset(self, *, seed=None, options=None):
-        if seed is None or isinstance(seed, int):
-            seed = [None if seed is None else seed + i for i in range(self.num_envs)]
-        calls = [
-            functools.partial(part.reset, seed=part_seeds, options=options)
-            for part, part_seeds in zip(self._parts, self._split(seed), strict=True)
-        ]
-        obs, _ = self._each(calls)  # FlatSpaces drops the infos
-        return np.concatenate(obs), {}
+        super().__init__(sync_vector_env(envs))
+        groups = np.array_split(np.arange(len(envs)), min(n_threads, len(envs)))
+        self._parts = [sync_vector_env([envs[i] for i in group]) for group in groups]
+        self._pool = ThreadPoolExecutor(len(groups))
 
     def step(self, actions):
-        parts = zip(self._parts, self._split(actions), strict=True)
-        calls = [functools.partial(part.step, part_actions) for part, part_actions in parts]
-        *arrays, parts_infos = self._each(calls)
-        infos = {}
-        for (i, j), part_infos in zip(self._slices(), parts_infos, strict=True):
-            if "final_obs" in part_infos:
-                infos.setdefault("final_obs", np.full(self.num_envs, None))
-                infos["final_obs"][i:j] = part_infos["final_obs"]
-        return *map(np.concatenate, arrays), infos
+        parts_actions = np.array_split(actions, len(self._parts))
+        results = self._pool.map(SyncVectorEnv.step, self._parts, parts_actions)
+        *arrays, parts_infos = zip(*results, strict=True)
+        final_obs = []
+        for part, infos in zip(self._parts, parts_infos, strict=True):
+            final_obs += list(infos.get("final_obs", [None] * part.num_envs))
+        return *map(np.concatenate, arrays), {"final_obs": final_obs}
 
-    def close_extras(self, **kwargs):
-        self._pool.shutdown()
-        for part in self._parts:
-            part.close()
+    def close(self, **kwargs):
+        self._pool.shutdown()  # waits for steps that are under way
+        super().close(**kwargs)
 
 
 # --- EnvPool
@@ -244,7 +188,7 @@ def changes_task(args):
 
 
 class EnvPoolVectorEnv(VectorEnv):
-    """The same tasks from EnvPool, in C++: what make_vector_env promises, but for the seeds."""
+    """The same tasks from EnvPool, in C++: what make_vector_env promises, with other seeds."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
@@ -257,38 +201,30 @@ class EnvPoolVectorEnv(VectorEnv):
         import envpool
 
         gym.logger.min_level = gym.logger.ERROR  # it has notices about its spaces
-        env_id = args.env_id
-        self._options = {"num_envs": n_envs, "num_threads": 1}
-        if env_id in GAIN_BY_THREADS:
-            self._options["num_threads"] = min(args.threads, n_envs)
-        spec = envpool.make_spec(ENVPOOL_TASKS[env_id])
-        self.env_id, self.num_envs, self._pool = env_id, n_envs, None
+        self._args, self.num_envs, self._pool = args, n_envs, None
+        spec = envpool.make_spec(ENVPOOL_TASKS[args.env_id])
         obs_dim = spaces.flatdim(spec.gymnasium_observation_space)
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
-        action_space = spec.gymnasium_action_space
-        low, high = np.float32(action_space.low), np.float32(action_space.high)
-        self.single_action_space = spaces.Box(low, high)
+        actions = spec.gymnasium_action_space
+        self.single_action_space = spaces.Box(np.float32(actions.low), np.float32(actions.high))
         self.observation_space = batch_space(self.single_observation_space, n_envs)
         self.action_space = batch_space(self.single_action_space, n_envs)
-        self._indices, self._action_dtype = np.arange(n_envs, dtype=np.int32), action_space.dtype
+        self._indices, self._action_dtype = np.arange(n_envs, dtype=np.int32), actions.dtype
         # "obs", or "obs:position" and so on; "reward", "done", "trunc"
         self._state_keys = spec._state_keys
         self._obs_keys = sorted(key for key in self._state_keys if key.split(":")[0] == "obs")
 
     def reset(self, *, seed=None, options=None):
-        """Starts new episodes. Only the first reset heeds the seeds, n_envs integers below 2^32.
+        """Starts new episodes. Only the first reset needs seeds, n_envs integers below 2^32.
 
-        An integer stands for seed, seed + 1 and so on, None for 0, 1 and so on. EnvPool takes its
-        seeds when it is made, which takes seconds; the environments' generators run on afterwards.
+        EnvPool takes its seeds when it is made, which takes seconds; afterwards the environments'
+        generators run on.
         """
         if self._pool is None:
-            if seed is None or isinstance(seed, int):
-                seed = [(seed or 0) + i for i in range(self.num_envs)]
             self._pool = self._make_pool(np.array(seed, np.uint32).view(np.int32))
             self._fresh = np.zeros(self.num_envs, bool)
-            self._obs = np.empty((self.num_envs, *self.single_observation_space.shape), np.float32)
-        # The others have just been reset by step
-        self._begin_episodes(np.flatnonzero(~self._fresh))
+            self._obs = np.empty(self.observation_space.shape, np.float32)
+        self._begin_episodes(~self._fresh)  # the others have just been reset by step
         return self._obs.copy(), {}
 
     def step(self, actions):
@@ -301,20 +237,18 @@ class EnvPoolVectorEnv(VectorEnv):
         state = self._receive()
         self._obs, rewards, truncated = state["obs"], state["reward"], state["trunc"]
         terminated = state["done"] & ~truncated
-        if self.env_id == "door-v0":  # EnvPool has the sign of the reaching term flipped as well
+        if self._args.env_id == "door-v0":
+            # As gymnasium-robotics, EnvPool rewards the distance between palm and handle
             rewards = rewards - 0.2 * np.linalg.norm(self._obs[:, -4:-1], axis=1)
-        elif self.env_id == "dm_control/ball_in_cup-catch-v0":
+        elif self._args.env_id == "dm_control/ball_in_cup-catch-v0":
             # EnvPool takes the radius of the cup's wall, 0.008, for the ball's, 0.025, and pays for
             # balls half outside. The observation begins with the positions (x, z) of cup and ball,
             # relative to (0, 0.6) and (0, 0.2).
             ball_to_target = self._obs[:, :2] - self._obs[:, 2:4] + (0, 0.6 - 0.05 - 0.2)
             rewards = (np.abs(ball_to_target) < 0.05 - 0.025).all(axis=1).astype(np.float32)
-        infos = {}
-        self._fresh = terminated | truncated
-        if self._fresh.any():
-            infos["final_obs"] = self._obs.copy()
-            self._begin_episodes(np.flatnonzero(self._fresh))
-        return self._obs, rewards, terminated, truncated, infos
+        final_obs, self._fresh = self._obs.copy(), terminated | truncated
+        self._begin_episodes(self._fresh)
+        return self._obs, rewards, terminated, truncated, {"final_obs": final_obs}
 
     def _make_pool(self, seeds):
         """Makes EnvPool's environments from models without what only pictures show.
@@ -324,6 +258,8 @@ class EnvPoolVectorEnv(VectorEnv):
         """
         import envpool
 
+        n_threads = self._args.threads if self._args.env_id in GAIN_BY_THREADS else 1
+        options = {"num_envs": self.num_envs, "num_threads": min(n_threads, self.num_envs)}
         originals = Path(envpool.registration.base_path, "mujoco")
         with tempfile.TemporaryDirectory() as folder:
             for models in ("assets_dmc", "robotics/assets/adroit_hand"):
@@ -337,15 +273,15 @@ class EnvPoolVectorEnv(VectorEnv):
                         copy.write_bytes(file.read_bytes().replace(b"<compiler ", lean))
                     else:
                         copy.symlink_to(file)
-            return envpool.make_gymnasium(
-                ENVPOOL_TASKS[self.env_id], seed=seeds, base_path=folder, **self._options
-            )
+            task = ENVPOOL_TASKS[self._args.env_id]
+            return envpool.make_gymnasium(task, seed=seeds, base_path=folder, **options)
 
-    def _begin_episodes(self, indices):
-        if len(indices):
-            self._pool._reset(self._indices[indices])
-            self._obs[indices] = self._receive()["obs"]
-            self._fresh[indices] = True
+    def _begin_episodes(self, chosen):
+        """chosen: (n_envs,) bool."""
+        if chosen.any():
+            self._pool._reset(self._indices[chosen])
+            self._obs[chosen] = self._receive()["obs"]
+            self._fresh = self._fresh | chosen
 
     def _receive(self):
         state = dict(zip(self._state_keys, self._pool._recv(), strict=True))

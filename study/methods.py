@@ -10,76 +10,34 @@ Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
 """
 
 import argparse
-import math
 import sys
 
 import torch
 from torch import nn
-from torch.func import functional_call
+from torch.distributions import Normal, kl_divergence
 
 import ppo_colored_continuous as ppo
 
 # --- A2C (Mnih et al. 2016): one step of the plain policy gradient for each short rollout
 
 
-def a2c_loss(params, batch, agent, args):
-    """The policy gradient's loss, as a function of the flat parameters; batch as in ppo_loss."""
+def a2c_loss(agent, batch, args):
+    """The policy gradient's loss; batch as in ppo_loss."""
     obs, actions, _, advantages, returns, _ = batch
-    named = ppo.unflatten(params, agent)
-    logprobs, entropy, values = functional_call(agent, named, (obs, actions))
+    logprobs, entropy, values = agent(obs, actions)
     policy_loss = -(advantages * logprobs).mean()
     value_loss = ((returns - values) ** 2).mean()
     loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
     return loss, {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
 
 
-def a2c_update(params, optimizer, batch, learning_rate, agent, args):
-    """The gradient step on the whole batch, by RMSprop, whose eps stands outside of the root."""
-    grads, metrics = torch.func.grad(a2c_loss, has_aux=True)(params, batch, agent, args)
-    grads = grads * (args.max_grad_norm / (grads.norm() + 1e-6)).clamp(max=1.0)
-    unused, square_avg, step = optimizer
-    square_avg = 0.99 * square_avg + 0.01 * grads**2
-    params = params - learning_rate * grads / (square_avg.sqrt() + 1e-5)
-    return params, (unused, square_avg, step + 1), metrics
-
-
-def a2c_learn(agent, optimizer, batch, learning_rate, update, args):
-    """In place of ppo.learn: moves the agent's parameters; returns the optimizer and metrics."""
-    params = nn.utils.parameters_to_vector(ppo.trainable(agent).values()).detach()
-    learning_rate = torch.tensor(learning_rate, dtype=torch.float64, device=args.device)
-    params, optimizer, metrics = update(params, optimizer, batch, learning_rate, agent, args)
-    nn.utils.vector_to_parameters(params, ppo.trainable(agent).values())
-    return optimizer, metrics
+def a2c_optimizer(agent, args):
+    return torch.optim.RMSprop(ppo.trainable(agent), args.learning_rate, alpha=0.99, eps=1e-5)
 
 
 # --- TRPO (Schulman et al. 2015): the largest step along the natural gradient that keeps KL < 0.01
 
 TARGET_KL, DAMPING, CG_STEPS, LINE_SEARCH_STEPS, SHRINK = 0.01, 0.1, 15, 10, 0.8
-
-
-def surrogate(params, batch, agent):
-    """Mean of advantage times probability ratio, as a function of the flat parameters."""
-    obs, actions, old_logprobs, advantages, *_ = batch
-    logprobs, *_ = functional_call(agent, ppo.unflatten(params, agent), (obs, actions))
-    return (advantages * (logprobs - old_logprobs).exp()).mean()
-
-
-def kl_divergence(params, old_params, obs, agent):
-    """KL divergence of the policies N(mean, std) of two flat parameter vectors, new || old.
-
-    The mean over observations and, as in sb3-contrib, action dimensions: that of a single one.
-    """
-
-    def mean_and_log_std(params):
-        named = ppo.unflatten(params, agent)
-        actor = {k.split(".", 1)[1]: p for k, p in named.items() if k.startswith("actor_mean.")}
-        return functional_call(agent.actor_mean, actor, obs), named["log_std"]
-
-    mean, log_std = mean_and_log_std(params)
-    old_mean, old_log_std = mean_and_log_std(old_params)
-    variance_ratio = (2 * (log_std - old_log_std)).exp()
-    distance = ((mean - old_mean) / old_log_std.exp()) ** 2
-    return 0.5 * (variance_ratio + distance - 1 - variance_ratio.log()).mean()
 
 
 def conjugate_gradient(product, b):
@@ -97,50 +55,62 @@ def conjugate_gradient(product, b):
     return x
 
 
-def trpo_actor(params, batch, agent):
-    """The actor's step. Returns the flat parameters, moved or as they were, and metrics."""
-    obs = batch[0]
+def flat_gradient(value, params, **kwargs):  # one vector, like parameters_to_vector's
+    return torch.cat([g.reshape(-1) for g in torch.autograd.grad(value, params, **kwargs)])
+
+
+def trpo_actor(agent, batch):
+    """The actor's step: moves the agent's parameters, or not; returns what is to be logged.
+
+    The KL divergence is of the new policy || the old one, the mean over observations and, as in
+    sb3-contrib, action dimensions: that of a single one.
+    """
+    obs, actions, old_logprobs, advantages, *_ = batch
+    params = [p for p in (*agent.actor_mean.parameters(), agent.log_std) if p.requires_grad]
+    old_params = nn.utils.parameters_to_vector(params).detach()
+
+    with torch.no_grad():
+        old_policy = Normal(agent.actor_mean(obs), agent.std())
+
+    def surrogate_and_kl():
+        policy = Normal(agent.actor_mean(obs), agent.std())
+        ratio = (policy.log_prob(actions).sum(-1) - old_logprobs).exp()
+        return (advantages * ratio).mean(), kl_divergence(policy, old_policy).mean()
+
+    before, kl = surrogate_and_kl()
+    gradient = flat_gradient(before, params, retain_graph=True)
+    kl_gradient = flat_gradient(kl, params, create_graph=True)
 
     def product(vector):  # of the Fisher matrix, the Hessian of the KL divergence, and a vector
-        kl_gradient = torch.func.grad(lambda p: kl_divergence(p, params, obs, agent))
-        return torch.func.jvp(kl_gradient, (params,), (vector,))[1] + DAMPING * vector
+        return flat_gradient(kl_gradient @ vector, params, retain_graph=True) + DAMPING * vector
 
-    gradient, before = torch.func.grad_and_value(surrogate)(params, batch, agent)
     direction = conjugate_gradient(product, gradient)
     longest = (2 * TARGET_KL / (direction @ product(direction))).sqrt()
-    for i in range(LINE_SEARCH_STEPS):
-        moved = params + SHRINK**i * longest * direction
-        after, kl = surrogate(moved, batch, agent), kl_divergence(moved, params, obs, agent)
-        if kl < TARGET_KL and after > before:
-            return moved, {"policy_loss": -after, "approx_kl": kl, "line_search_steps": i + 1}
-    return params, {"policy_loss": -before, "approx_kl": 0, "line_search_steps": LINE_SEARCH_STEPS}
+    with torch.no_grad():
+        for i in range(LINE_SEARCH_STEPS):
+            step = SHRINK**i * longest * direction
+            nn.utils.vector_to_parameters(old_params + step, params)
+            after, kl = surrogate_and_kl()
+            if kl < TARGET_KL and after > before:
+                return {"policy_loss": -after, "approx_kl": kl, "line_search_steps": i + 1}
+        nn.utils.vector_to_parameters(old_params, params)
+    return {"policy_loss": -before.detach(), "approx_kl": 0, "line_search_steps": LINE_SEARCH_STEPS}
 
 
-def critic_loss(params, minibatch, agent):
-    obs, actions, _, _, returns, _ = minibatch
-    *_, values = functional_call(agent, ppo.unflatten(params, agent), (obs, actions))
-    loss = ((returns - values) ** 2).mean()
+def critic_loss(agent, minibatch, args):
+    """The critic's only: its gradient is zero for the other parameters, which Adam leaves alone."""
+    obs, _, _, _, returns, _ = minibatch
+    loss = ((returns - agent.critic(obs).squeeze(-1)) ** 2).mean()
     return loss, {"value_loss": loss}
 
 
-def critic_update(params, optimizer, minibatch, learning_rate, agent, args):
-    """A step of Adam on the value loss, whose gradient is zero for all but the critic."""
-    grads, metrics = torch.func.grad(critic_loss, has_aux=True)(params, minibatch, agent)
-    params, optimizer = ppo.adam(params, grads, optimizer, learning_rate)
-    return params, optimizer, metrics
-
-
-def trpo_learn(agent, optimizer, batch, learning_rate, update, args):
+def trpo_learn(agent, optimizer, batch, gradients, args):
     """In place of ppo.learn: a step of the actor on the whole batch, then epochs of the critic."""
     obs, actions, logprobs, advantages, *rest = batch
     if args.normalize_advantage:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    batch = (obs, actions, logprobs, advantages, *rest)
-    params = nn.utils.parameters_to_vector(ppo.trainable(agent).values()).detach()
-    params, actor_metrics = trpo_actor(params, batch, agent)
-    nn.utils.vector_to_parameters(params, ppo.trainable(agent).values())
-    optimizer, metrics = ppo.learn(agent, optimizer, batch, learning_rate, update, args)
-    return optimizer, metrics | actor_metrics
+    metrics = trpo_actor(agent, (obs, actions, logprobs, advantages, *rest))
+    return ppo.learn(agent, optimizer, batch, gradients, args) | metrics
 
 
 # --- gSDE (Raffin et al. 2021): noise that is a function of the state, the same for a whole rollout
@@ -157,33 +127,38 @@ class GSDEAgent(ppo.Agent):
         """As in Agent; the density of an action is that over all W."""
         hidden = self.actor_mean[:-1](obs)
         mean = self.actor_mean[-1](hidden)
-        variance = hidden.detach() ** 2 @ (2 * self.log_std).exp()  # the noise trains log_std only
-        std = (variance + 1e-6).sqrt()
-        z = (actions - mean) / std
-        logprobs = (-0.5 * z**2 - std.log() - 0.5 * math.log(2 * math.pi)).sum(-1)
-        entropy = (0.5 + 0.5 * math.log(2 * math.pi) + std.log()).sum(-1).mean()
+        variance = hidden.detach() ** 2 @ self.std() ** 2  # the noise trains log_std only
+        policy = Normal(mean, (variance + 1e-6).sqrt(), validate_args=False)
+        logprobs, entropy = policy.log_prob(actions).sum(-1), policy.entropy().sum(-1).mean()
         return logprobs, entropy, self.critic(obs).squeeze(-1)
 
 
 def gsde_exploration(agent, noise, args):
     """In place of ppo.exploration: a matrix W, (64, action_dim), per environment and rollout."""
-    weights = torch.randn(args.n_envs, *agent.log_std.shape) * agent.log_std.exp().detach().cpu()
-    weights, policy = weights.numpy(), ppo.numpy_policy(agent.actor_mean)
-    hidden = ppo.numpy_policy(agent.actor_mean[:-1])
-    return lambda obs, t: policy(obs) + (hidden(obs)[:, None, :] @ weights)[:, 0]
+    weights = torch.randn(args.n_envs, *agent.log_std.shape) * agent.std().detach().cpu()
+    weights, hidden = weights.numpy(), ppo.numpy_policy(agent.actor_mean[:-1])
+    mean = ppo.numpy_policy(agent.actor_mean[-1:])  # of the hidden layer
+
+    def act(obs, t):
+        h = hidden(obs)
+        return mean(h) + (h[:, None, :] @ weights)[:, 0]
+
+    return act
 
 
 # --- What each method replaces, its defaults, and the script's flags that it does not have
 
 METHODS = {
     "a2c": dict(
-        replaces=dict(learn=a2c_learn, update=a2c_update),
-        defaults=dict(n_steps=5, learning_rate=7e-4, gae_lambda=1.0, normalize_advantage=False),
+        replaces=dict(loss=a2c_loss, make_optimizer=a2c_optimizer),
+        defaults=dict(
+            n_steps=5, learning_rate=7e-4, gae_lambda=1.0, normalize_advantage=False, n_epochs=1
+        ),
         lacks=["batch-size", "n-epochs", "clip-range", "normalize-advantage"],
     ),
     "trpo": dict(
-        replaces=dict(learn=trpo_learn, update=critic_update),
-        defaults=dict(learning_rate=1e-3),  # of the critic
+        replaces=dict(learn=trpo_learn, loss=critic_loss),
+        defaults=dict(learning_rate=1e-3, max_grad_norm=1e9),  # of the critic: no clipping
         lacks=["clip-range", "ent-coef", "vf-coef", "max-grad-norm"],
     ),
     "gsde": dict(
@@ -207,6 +182,8 @@ def main(argv):
         if any(word.split("=")[0] in (f"--{flag}", f"--no-{flag}") for word in flags):
             parser.error(f"{name} has no --{flag}")
     args = ppo.parse_args(flags, method=name, exp_name=name, **method["defaults"])
+    if name == "a2c":
+        args.batch_size = args.n_envs * args.n_steps  # one step on the whole batch
     ppo.main(args, **method["replaces"])
 
 

@@ -6,17 +6,17 @@ from gymnasium.wrappers.utils import RunningMeanStd
 
 
 class NormalizedVectorEnv(VectorWrapper):
-    """Normalizes observations and rewards by running statistics, as VecNormalize does.
+    """Normalizes observations and rewards as VecNormalize of Stable-Baselines3 does.
 
-    That is Stable-Baselines3's. Observations are brought to mean 0 and std 1 of all so far. Rewards
-    are divided by the std of the discounted return so far; their mean stays, it is part of the
-    task; they are in infos["raw_rewards"] as they were. Both are clipped at 10.
+    Observations are brought to mean 0 and std 1 of all up to now. Rewards are divided by the std of
+    the discounted return up to now; their mean is part of the task and stays. Both are clipped to
+    [-10, 10]. The rewards as they were are in infos["raw_rewards"].
     """
 
     def __init__(self, env, args):
         super().__init__(env)
         self._args, self._training = args, True
-        self._returns = np.zeros(self.num_envs)  # discounted, of the episodes up to now
+        self._returns = np.zeros(self.num_envs)  # discounted, of each environment's episode
         self._statistics = {}
         if args.normalize_obs:
             self._statistics["obs"] = RunningMeanStd(shape=env.single_observation_space.shape)
@@ -24,7 +24,10 @@ class NormalizedVectorEnv(VectorWrapper):
             self._statistics["returns"] = RunningMeanStd()
 
     def frozen(self, env):
-        """Another environment, its observations normalized as here; it changes no statistics."""
+        """Another vector environment with this one's normalization of observations, to evaluate in.
+
+        It has no rewards normalized, and changes no statistics.
+        """
         other = NormalizedVectorEnv(env, self._args)
         other._training = False
         other._statistics = {k: v for k, v in self._statistics.items() if k == "obs"}

@@ -145,11 +145,13 @@ def improvement(*cells, axis=-1):
 def stratified(samples, statistic):
     """Value and 95 % percentile bootstrap interval of statistic(*samples), drawn within samples.
 
-    NaN for all without samples, for the interval where one of them has a single run.
+    NaN for all without samples. No interval (NaN) where one has less than five runs: it would be
+    too narrow. Of normal samples half a standard deviation apart, simulated, it holds the true
+    `improvement` in 84 % of cases with 3 runs in 1 cell, 86 % with 2 in 9, and 93 % with 5 in 9.
     """
     if not samples:
         return np.nan, np.nan, np.nan
-    if min(map(len, samples)) < 2:
+    if min(map(len, samples)) < 5:
         return statistic(*samples), np.nan, np.nan
     how = {"n_resamples": 2000, "batch": 200, "rng": np.random.default_rng(0)}
     how |= {"method": "percentile", "vectorized": True}

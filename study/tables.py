@@ -226,7 +226,7 @@ def robust_statistics(runs):
     - `improvement`: probability that a run does better than one with beta 0, averaged over cells.
 
     Cells are the environments and n_envs that have all betas. The 95 % bootstrap is stratified:
-    runs are drawn within each cell, where there are two or more in all.
+    runs are drawn within each cell, where there are five or more in all.
     """
     runs = comparable(runs, ["beta"], CELL)
     groups = runs.assign(z=standardize(runs)).groupby(["beta", *CELL]).z

@@ -134,6 +134,14 @@ def test_trpo(monkeypatch, noise, seed, damping, shrink, steps):
     assert moved[-n_critic:].max() > 5e-3 and (moved[:-n_critic].max() > 5e-3) == (steps < 10)
 
 
+def test_trpo_refuses_a_step_that_makes_the_policy_worse(monkeypatch):
+    agent, *_ = make_pair(TRPO, "trpo", batch_size=SIZE)
+    batch, before, solve = random_batch(agent), flat(agent.parameters()), methods.conjugate_gradient
+    monkeypatch.setattr(methods, "conjugate_gradient", lambda *system: -solve(*system))
+    assert methods.trpo_actor(agent, batch)["approx_kl"] == 0
+    assert torch.equal(flat(agent.parameters()), before)
+
+
 def test_conjugate_gradient(monkeypatch):
     from sb3_contrib.common.utils import conjugate_gradient_solver
 

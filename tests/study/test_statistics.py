@@ -103,12 +103,23 @@ def test_probability_of_improvement():
 
 def test_stratified_bootstrap():
     """Cells that differ widely, but not within themselves, leave no uncertainty."""
-    samples = [np.full(4, 0.0), np.full(4, 9.0)]
+    samples = [np.full(5, 0.0), np.full(5, 9.0)]
     assert statistics.stratified(samples, statistics.iqm) == (4.5, 4.5, 4.5)
-    mean, low, high = statistics.stratified([np.array([1.0, 2, 3, 4])], statistics.iqm)
-    assert low < mean == 2.5 < high
-    single = statistics.stratified([np.array([3.0])], statistics.iqm)
-    assert single[0] == 3 and np.isnan(single[1:]).all()
+    mean, low, high = statistics.stratified([np.array([1.0, 2, 3, 4, 5])], statistics.iqm)
+    assert low < mean == 3 < high
+    few = statistics.stratified([np.array([1.0, 2, 3, 4])], statistics.iqm)
+    assert few[0] == 2.5 and np.isnan(few[1:]).all()
+
+
+def test_the_interval_of_five_seeds_in_nine_cells_holds_what_it_should():
+    """The true probability of improvement of a shift by half a standard deviation."""
+    rng, held, true = np.random.default_rng(0), 0, stats.norm.cdf(0.5 / 2**0.5)
+    for _ in range(60):
+        z = rng.normal(size=(18, 5))
+        z[:9] += 0.5
+        _, low, high = statistics.stratified(list(z), statistics.improvement)
+        held += low < true < high
+    assert 0.85 <= held / 60 < 1
 
 
 def test_contrast_is_welchs_interval_where_the_environment_is_all_there_is():

@@ -1,0 +1,318 @@
+"""The door, threads, small models; and environments of others, as the agent sees them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import ppo_colored_continuous as ppo
+from study.environments import GAIN_BY_THREADS, ThreadedVectorEnv
+from study.protocol import NAMES
+
+ROOT = Path(ppo.__file__).parent
+
+
+def parse(flags):
+    return ppo.parse_args(flags.split())
+
+
+def make_envs(flags, n_envs):
+    return ppo.make_vector_env(parse(f"{flags} --no-envpool"), n_envs)
+
+
+def python(code, *flags, cwd=ROOT):
+    command = [sys.executable, *flags, "-c", code]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+    return done.returncode, done.stdout, done.stderr
+
+
+# --- Environments of others, as the agent sees them
+
+
+class Plain(gym.Env):
+    """Its spaces and observations are set by the test. Asserts that actions are in its space."""
+
+    observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    observation = np.zeros(1, np.float32)
+
+    def reset(self, seed=None, options=None):
+        return self.observation, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), (action, self.action_space)
+        self.last_action = action
+        return self.observation, 0.0, False, False, {}
+
+
+gym.register("Plain-v0", Plain, max_episode_steps=3)
+FLOATS = np.array([0.5, 300.25, -7.125], np.float64)
+BYTES, COUNTS = (gym.spaces.Box(0, 255, (3,), dtype) for dtype in (np.uint8, np.int64))
+DICT = gym.spaces.Dict(b=BYTES, a=COUNTS)
+
+
+@pytest.mark.parametrize(
+    "space, observation, expected",
+    [
+        (BYTES, FLOATS, FLOATS),
+        (DICT, {"b": FLOATS, "a": -FLOATS}, [*FLOATS, *-FLOATS]),
+        (gym.spaces.Tuple([BYTES, DICT]), (FLOATS, {"b": 2 * FLOATS, "a": -FLOATS}),
+         [*FLOATS, *(2 * FLOATS), *-FLOATS]),
+        (gym.spaces.Dict(a=COUNTS, b=gym.spaces.Discrete(3)), {"a": FLOATS, "b": 1},
+         [*FLOATS, 0, 1, 0]),
+    ],
+)  # fmt: skip
+def test_observations_are_float32_whatever_the_space_says(
+    monkeypatch, space, observation, expected
+):
+    """Also those at a time limit, which the critic sees."""
+    monkeypatch.setattr(Plain, "observation_space", space)
+    monkeypatch.setattr(Plain, "observation", observation)
+    envs = make_envs("--env-id Plain-v0", 1)
+    seen = [envs.reset(seed=[0])[0][0].copy()]
+    for _ in range(3):
+        obs, *_, infos = envs.step(np.zeros((1, 1), np.float32))
+        seen.append(obs[0].copy())
+    seen.append(infos["final_obs"][0])
+    for obs in seen:
+        assert obs.dtype == np.float32
+        np.testing.assert_array_equal(obs, np.float32(expected))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_rescaled_actions_never_leave_the_bounds(monkeypatch, dtype):
+    rng = np.random.default_rng(0)
+    low, high = np.sort(rng.normal(size=(2, 2000)) * 10 ** rng.uniform(-2, 2, 2000), axis=0)
+    space = gym.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
+    monkeypatch.setattr(Plain, "action_space", space)
+    env = ppo.make_env(parse("--env-id Plain-v0 --rescale-actions --no-envpool"))
+    assert env.action_space == gym.spaces.Box(-1, 1, (2000,), dtype)
+    for value in (-1, 0, 0.4, 1):
+        env.reset(seed=0)
+        env.step(np.full(2000, value, np.float32))
+        low, high = (bound.astype(float) for bound in (space.low, space.high))
+        error = env.unwrapped.last_action - (low + (value + 1) / 2 * (high - low))
+        assert (abs(error) <= 1e-3 * (abs(low) + abs(high))).all()
+    monkeypatch.setattr(Plain, "action_space", gym.spaces.Box(-np.inf, np.inf, (1,)))
+    with pytest.raises(ValueError, match="--rescale-actions needs bounds"):
+        ppo.make_env(parse("--env-id Plain-v0 --rescale-actions"))
+
+
+class FromSpaces(Plain):
+    """Its observation is a sample of each of its spaces."""
+
+    def __init__(self):
+        self.action_space = gym.spaces.Box(-1, 1, (1,))
+        self.observation_space = gym.spaces.Box(-1, 1, (2,))
+
+    def reset(self, seed=None, options=None):
+        drawn = self.observation_space.sample()[0], self.action_space.sample()[0]
+        return np.array(drawn, np.float32), {}
+
+
+gym.register("FromSpaces-v0", FromSpaces)
+
+
+def test_seeds_reach_the_spaces_of_each_environment():
+    first, again = (make_envs("--env-id FromSpaces-v0", 3).reset(seed=[1, 2, 1])[0] for _ in "ab")
+    np.testing.assert_array_equal(first, again)
+    assert (first[0] == first[2]).all() and (first[0] != first[1]).all()
+
+
+MINE = """
+import gymnasium as gym, numpy as np
+class Mine(gym.Env):
+    observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    def reset(self, seed=None, options=None): return np.zeros(1, np.float32), {}
+    def step(self, action): return np.zeros(1, np.float32), 0.0, True, False, {}
+gym.register("Mine-v0", Mine)
+"""
+
+
+def test_a_users_module_may_have_the_name_of_one_of_ours(tmp_path):
+    (tmp_path / "mazes.py").write_text(MINE)
+    (tmp_path / "random.py").write_text("1 / 0")  # hides nothing
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); import ppo_colored_continuous as ppo; "
+    code += "envs = ppo.make_vector_env(ppo.parse_args(['--env-id', 'mazes:Mine-v0']), 2); "
+    code += "print(type(envs.envs[0].unwrapped).__module__)"
+    assert python(code, "-P", cwd=tmp_path) == (0, "mazes\n", "")
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "PointUMaze-v1", "dm_control/reacher-hard-v0"])
+def test_max_episode_steps_takes_the_place_of_the_limit(env_id):
+    for limit in (3, 1002):
+        envs = make_envs(f"--env-id {env_id} --max-episode-steps {limit}", 1)
+        envs.reset(seed=[1])
+        action = np.zeros(envs.action_space.shape, np.float32)
+        ends = [bool(envs.step(action)[3][0]) for _ in range(limit)]
+        assert ends == [False] * (limit - 1) + [True]
+
+
+def test_arguments_of_the_environment():
+    kwargs = json.dumps({"goal": [3, -2]})
+    args = ppo.parse_args(["--env-id", "PointPushMaze-v1", "--env-kwargs", kwargs])
+    assert ppo.make_env(args).unwrapped.goal == (3, -2)
+
+
+# --- Threads
+
+
+def trajectory(envs, n_steps):
+    """Copies of all that reset and step return, over more than one episode of some environments."""
+    rng = np.random.default_rng(0)
+    obs, _ = envs.reset(seed=[5, 1, 4, 2, 3])
+    results = [obs.copy()]
+    for _ in range(n_steps):
+        actions = rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+        *arrays, infos = envs.step(actions)
+        final_obs = infos.get("final_obs", [None] * 5)
+        results += [a.copy() for a in arrays] + [f for f in final_obs if f is not None]
+        results.append(np.array([f is not None for f in final_obs]))
+    return [(a.shape, a.dtype, a.tobytes()) for a in results]
+
+
+@pytest.mark.parametrize("env_id", ["SwimmerUMaze-v1", "Hopper-v5"])
+@pytest.mark.parametrize("threads", [2, 3, 9])
+def test_threads_change_nothing(env_id, threads, monkeypatch):
+    """Hopper falls at another step in each environment; the maze's episodes end together."""
+    monkeypatch.setattr("study.environments.GAIN_BY_THREADS", {"SwimmerUMaze-v1", "Hopper-v5"})
+    flags = f"--env-id {env_id} --max-episode-steps 40 --threads"
+    single, threaded = make_envs(f"{flags} 1", 5), make_envs(f"{flags} {threads}", 5)
+    assert isinstance(threaded, ThreadedVectorEnv) and not isinstance(single, ThreadedVectorEnv)
+    for name in ("observation_space", "single_observation_space", "single_action_space"):
+        assert getattr(threaded, name) == getattr(single, name)
+    assert threaded.metadata["autoreset_mode"] == single.metadata["autoreset_mode"]
+    assert trajectory(single, 100) == trajectory(threaded, 100)
+    threaded.close()
+
+
+def test_threads_step_only_what_is_known_to_share_nothing():
+    """An environment of a user may share a file, a simulator or a variable."""
+    assert NAMES.keys() >= GAIN_BY_THREADS
+    for env_id in ("Pendulum-v1", "Hopper-v5", "Plain-v0", "PointUMaze-v1"):
+        assert not isinstance(make_envs(f"--env-id {env_id} --threads 2", 4), ThreadedVectorEnv)
+    one = make_envs("--env-id SwimmerUMaze-v1 --threads 2", 1)
+    assert not isinstance(one, ThreadedVectorEnv)
+
+
+class Fault(Plain):
+    def step(self, action):
+        return self.observation, 1 / float(action[0]), False, False, {}
+
+
+gym.register("Fault-v0", Fault)
+
+
+@pytest.mark.parametrize("faulty", [0, 1, 4])
+def test_errors_in_threads_come_through(faulty):
+    envs = ThreadedVectorEnv([ppo.make_env(parse("--env-id Fault-v0")) for _ in range(5)], 3)
+    envs.reset(seed=[0] * 5)
+    actions = np.ones((5, 1), np.float32)
+    actions[faulty] = 0
+    with pytest.raises(ZeroDivisionError) as caught:
+        envs.step(actions)
+    assert "1 / float(action[0])" in str(caught.traceback[-1].statement)
+    envs.close()
+
+
+# --- Models without what is only seen
+
+
+def assert_same(one, other, n_steps=200):
+    rng = np.random.default_rng(0)
+    assert one.reset(seed=3)[0].tobytes() == other.reset(seed=3)[0].tobytes()
+    for _ in range(n_steps):
+        action = rng.uniform(-1, 1, one.action_space.shape).astype(np.float32)
+        (obs, reward, *_), (other_obs, other_reward, *_) = one.step(action), other.step(action)
+        assert obs.tobytes() == other_obs.tobytes() and reward == other_reward
+
+
+@pytest.mark.parametrize("task", ["cheetah-run", "ball_in_cup-catch", "reacher-hard"])
+def test_models_without_textures_move_the_same(task):
+    """Bit for bit, beside dm_control's own, whose textures are whole again afterwards."""
+    flags = f"--env-id dm_control/{task}-v0"
+    small, whole = make_envs(flags, 1).envs[0], ppo.make_env(parse(flags))
+    assert small.unwrapped._env.physics.model.tex_data.nbytes < 1000
+    assert whole.unwrapped._env.physics.model.tex_data.nbytes > 10_000_000
+    assert_same(small, whole)
+
+
+# --- The door
+
+
+def test_the_door_without_what_is_only_seen_moves_the_same():
+    small, whole = (gym.make("door-v0", render_mode=m).unwrapped for m in (None, "rgb_array"))
+    assert small.model.ntex == small.model.nmesh == 0 < whole.model.ntex
+    assert_same(small, whole)
+
+
+def d4rl_reward(env):
+    """D4RL's formula, from the simulator's state."""
+    palm, handle = env.data.site("S_grasp").xpos, env.data.site("S_handle").xpos
+    hinge = env.data.joint("door_hinge").qpos[0]
+    reward = -0.1 * np.linalg.norm(palm - handle) - 0.1 * (hinge - 1.57) ** 2
+    reward -= 1e-5 * np.sum(env.data.qvel**2)
+    return reward + 2 * (hinge > 0.2) + 8 * (hinge > 1.0) + 10 * (hinge > 1.35)
+
+
+@pytest.fixture(scope="module")
+def door():
+    return gym.make("door-v0").unwrapped
+
+
+def test_reward_is_d4rls_at_random_states(door):
+    rng = np.random.default_rng(0)
+    for seed in range(3):
+        door.reset(seed=seed)
+        for _ in range(40):
+            obs, reward, terminated, truncated, _ = door.step(rng.uniform(-1, 1, 28))
+            assert reward == pytest.approx(d4rl_reward(door), rel=1e-12)
+            assert not terminated and not truncated
+            palm, handle = door.data.site("S_grasp").xpos, door.data.site("S_handle").xpos
+            np.testing.assert_array_equal(obs[-4:-1], palm - handle)
+
+
+@pytest.mark.parametrize("hinge, bonus", [(0.1, 0), (0.3, 2), (1.1, 10), (1.5, 20)])
+def test_reward_is_d4rls_at_open_doors(door, hinge, bonus):
+    rng = np.random.default_rng(0)
+    for seed in range(3):
+        door.reset(seed=seed)
+        state = door.get_env_state()
+        state["qpos"] += 0.02 * rng.standard_normal(30)
+        state["qpos"][28:] = hinge, 1.5  # the latch is turned
+        door.set_env_state(state)
+        reward, info = door.step(rng.uniform(-1, 1, 28))[1::3]
+        assert reward == pytest.approx(d4rl_reward(door), rel=1e-12)
+        assert bonus - 2 < reward < bonus  # the costs are small beside the bonus
+        assert info["success"] == (bonus == 20)
+
+
+@pytest.mark.filterwarnings("ignore")  # it recommends bounds
+def test_gymnasium_checks_and_the_limit(door):
+    check_env(door, skip_render_check=True)
+    assert gym.spec("door-v0").max_episode_steps == 200 and door.observation_space.shape == (39,)
+    assert door.action_space == gym.spaces.Box(-1, 1, (28,), np.float32)
+
+
+# --- Imports and messages
+
+
+def test_importing_is_quick():
+    slow = ["mujoco", "gymnasium_robotics", "dm_control", "shimmy", "torch", "envpool", "pandas"]
+    code = f"import sys, study.environments; print([x for x in {slow} if x in sys.modules])"
+    assert python(code) == (0, "[]\n", "")
+
+
+def test_making_and_stepping_is_silent():
+    """The packages have notices, and both cheetahs' models a deprecated setting."""
+    code = """if True:
+        import numpy as np, ppo_colored_continuous as ppo
+        for env_id in ("door-v0", "dm_control/cheetah-run-v0", "HalfCheetah-v5"):
+            envs = ppo.make_vector_env(ppo.parse_args(["--env-id", env_id, "--no-envpool"]), 1)
+            envs.reset(seed=[0])
+            envs.step(np.zeros(envs.action_space.shape, np.float32))"""
+    assert python(code) == (0, "", "")
