@@ -7,9 +7,9 @@ Everything else is PPO as Stable-Baselines3 has it.
 
     python ppo_colored_continuous.py --env-id MountainCarContinuous-v0 --beta 0.5
 
-It needs colored_noise.py and the packages imported below. Where the project's folder study/ is
-beside it, that adds faster environments, those of the paper, and normalization.
-To change the method, edit this file. main(), at its end, reads as the method does.
+It needs colored_noise.py and the packages imported below. If the project's folder study/ is next
+to it, that adds faster environments, the paper's environments, and normalization.
+To change the method, edit this file. Start with main(), at its end.
 """
 
 import argparse
@@ -51,9 +51,13 @@ except ModuleNotFoundError as error:
     study = None
 
 
+def beta_or_auto(text):
+    return text if text == "auto" else float(text)
+
+
 def parse_args(argv=None, **defaults):
-    """Reads the command line, or the list argv; `defaults` replace those that stand here."""
-    flag, auto = argparse.BooleanOptionalAction, "auto"
+    """Reads the command line, or the list argv; `defaults` override those below."""
+    flag = argparse.BooleanOptionalAction
     show_defaults = argparse.ArgumentDefaultsHelpFormatter
     parser = argparse.ArgumentParser(formatter_class=show_defaults, allow_abbrev=False)
     add = parser.add_argument_group("experiment").add_argument
@@ -62,17 +66,16 @@ def parse_args(argv=None, **defaults):
     add("--total-timesteps", type=int, default=2_048_000, help="of all environments together")
     add("--eval-freq", type=int, default=10_240, help="environment steps between evaluations")
     add("--eval-episodes", type=int, default=50, help="episodes per evaluation, in parallel")
-    add("--eval-once-per-policy", action=flag, default=False, help="evaluate each policy once, and "
-        "repeat the result where several evaluations are due before an update")  # fmt: skip
+    add("--eval-once-per-policy", action=flag, default=False, help="one evaluation per update")
     add = parser.add_argument_group("environment").add_argument
     add("--env-kwargs", type=json.loads, help="its keyword arguments, as in '{\"goal\": [3, 0]}'")
     add("--max-episode-steps", type=int, help="a time limit in place of the environment's own")
     add("--rescale-actions", action=flag, default=False, help="map [-1, 1] to the action bounds")
-    add("--normalize-obs", action=flag, default=False, help="by their running mean and std")
+    add("--normalize-obs", action=flag, default=False, help="by the running mean and std")
     add("--normalize-rewards", action=flag, default=False, help="by the std of discounted returns")
     add = parser.add_argument_group("colored noise").add_argument
-    add("--beta", type=lambda text: text if text == auto else float(text), nargs="+", default=[0.5],
-        help="0 white, 1 pink, 2 red; one per action dimension; auto: by the batch")  # fmt: skip
+    add("--beta", type=beta_or_auto, nargs="+", default=[0.5], help="0 white, 1 pink, 2 red; one "
+        "value, or one per action dimension; auto: from the size of a batch")  # fmt: skip
     add("--noise-seq-len", type=int, default=1000, help="T, steps until sequences are drawn anew")
     add("--vanilla", action="store_true", help="white noise from torch, as in ordinary PPO")
     add = parser.add_argument_group("PPO").add_argument
@@ -92,7 +95,12 @@ def parse_args(argv=None, **defaults):
     add("--bootstrap-timeouts", action=flag, default=True, help="add gamma * V(obs) at time limits")
     add = parser.add_argument_group("running").add_argument
     add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
-    add("--threads", type=int, default=os.cpu_count(), help="that step environments; needs study/")
+    add(
+        "--threads",
+        type=int,
+        default=os.cpu_count(),
+        help="threads that step environments; needs study/",
+    )
     add("--compile", action=flag, help="compile the loss and its gradients, which takes 10 to 40 "
         "seconds; by default in runs of 100,000 steps and more")  # fmt: skip
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
@@ -109,8 +117,7 @@ def parse_args(argv=None, **defaults):
         parser.error("numbers of steps, episodes and environments must be positive")
     last_evaluation = args.total_timesteps // args.eval_freq * args.eval_freq
     if last_evaluation < args.n_envs * args.n_steps:
-        parser.error(f"the first update, after {args.n_envs} * {args.n_steps} steps, comes after "
-                     f"the last evaluation, at {last_evaluation}: lower --n-steps")  # fmt: skip
+        parser.error(f"no update before the last evaluation, at {last_evaluation}: lower --n-steps")
     if args.resume and args.overwrite:
         parser.error("--resume continues a run and --overwrite starts it again: choose one")
     if study is None and (args.envpool or args.normalize_obs or args.normalize_rewards):
@@ -119,17 +126,15 @@ def parse_args(argv=None, **defaults):
         args.envpool = study is not None and study.envpool_suits(args)
     if args.compile is None:
         args.compile = args.total_timesteps >= 100_000
-    args.beta_auto = args.beta == [auto]
+    args.beta_auto = args.beta == ["auto"]
     if args.beta_auto:
         args.beta = [projected_beta(args.n_envs, args.n_steps, args.noise_seq_len)]
-    elif auto in args.beta:
+    elif "auto" in args.beta:
         parser.error("--beta auto is one value for all action dimensions")
     return args
 
 
 # --- The networks
-
-
 def layer_init(layer, gain=2**0.5):
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
@@ -137,7 +142,11 @@ def layer_init(layer, gain=2**0.5):
 
 
 class Agent(nn.Module):
-    """Separate actor and critic. Any layers but BatchNorm will do; frozen ones are not learned."""
+    """Separate actor and critic. Any layers will do but BatchNorm and Dropout.
+
+    Parameters with requires_grad=False are not learned. Rollout and evaluation call actor_mean, std
+    and critic: what is added in forward alone does not act.
+    """
 
     def __init__(self, obs_dim, action_dim):
         super().__init__()
@@ -177,9 +186,10 @@ def numpy_policy(actor):
 
     For networks this small numpy is quicker than torch: 6 us for 4 rows, not 31. It is used if all
     layers are known here; otherwise the module is called, in eval mode. Either way the weights are
-    copied, so make the function anew when the module has learned.
+    copied, so call numpy_policy again when the module has learned.
     """
     known = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
+    # Hooks may change weights or outputs in each call, as spectral_norm's do
     hooks = any(m._forward_hooks or m._forward_pre_hooks for m in actor.modules())
     functions = []
     for layer in actor if type(actor) is nn.Sequential and not hooks else [actor]:
@@ -188,7 +198,7 @@ def numpy_policy(actor):
             functions.append(lambda x, weight=weight, bias=bias: x @ weight + bias)
         elif type(layer) in known:
             functions.append(known[type(layer)])
-        else:
+        else:  # one layer is unknown: call the whole module
             module, device = copy.deepcopy(actor).eval(), next(actor.parameters()).device
             return lambda obs: module(torch.as_tensor(obs, device=device)).detach().cpu().numpy()
 
@@ -201,10 +211,8 @@ def numpy_policy(actor):
 
 
 # --- The environments
-
-
 class FlatEnv(gym.Wrapper):
-    """Makes observations one float32 vector (a Dict in its order of keys), and actions one, too."""
+    """Makes observations one float32 vector (a Dict in its order), and actions one; drops infos."""
 
     def __init__(self, env, rescale_actions):
         super().__init__(env)
@@ -220,15 +228,18 @@ class FlatEnv(gym.Wrapper):
             self.env.action_space.seed(seed)
             self.env.observation_space.seed(seed)
         obs, _ = self.env.reset(seed=seed, options=options)
-        return spaces.flatten(self._space, obs), {}
+        return self._flat(obs), {}
 
     def step(self, action):
         if self._rescale:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
-            action = np.clip(action, self._low, self._high)  # of rounding
+            action = np.clip(action, self._low, self._high)  # rounding may leave them
         action = action.astype(self._low.dtype).reshape(self.env.action_space.shape)
         obs, reward, terminated, truncated, _ = self.env.step(action)
-        return spaces.flatten(self._space, obs), reward, terminated, truncated, {}
+        return self._flat(obs), reward, terminated, truncated, {}
+
+    def _flat(self, obs):
+        return spaces.flatten(self._space, obs).astype(np.float32)
 
 
 def float32_space(space):
@@ -244,21 +255,22 @@ def float32_space(space):
 def make_env(args, render_mode=None):
     """Makes one environment: obs (obs_dim,) float32, actions (action_dim,).
 
-    This is the place for a wrapper of yours. EnvPool's are not made here: --no-envpool.
+    Add your wrappers here. EnvPool's environments are not made here: use --no-envpool.
     """
     kwargs = dict(args.env_kwargs or {}) | ({"render_mode": render_mode} if render_mode else {})
     if args.env_id.startswith("dm_control/"):
         import shimmy  # noqa: F401  registers dm_control's ids
 
-        if args.max_episode_steps:  # the task's own limit, in seconds, is inside of this one
+        if args.max_episode_steps:  # the task's own limit, in seconds, would come first
             kwargs["task_kwargs"] = {"time_limit": math.inf} | kwargs.get("task_kwargs", {})
     module, _, name = args.env_id.rpartition(":")
     if module:  # my_env:MyEnv-v0, registered by my_env.py in the current folder, or installed
-        sys.path.append(os.getcwd())
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())
         file = importlib.import_module(module).__file__
         if name not in gym.registry:
             raise LookupError(f"the module {module}, which is {file}, registers no {name}")
-    # Gymnasium's checks of the first steps are for who writes an environment, and take time
+    # Gymnasium's checks of the first steps help authors of environments, but take time
     env = gym.make(name, args.max_episode_steps, disable_env_checker=True, **kwargs)
     actions = env.action_space
     if not isinstance(actions, spaces.Box) or not np.issubdtype(actions.dtype, np.floating):
@@ -279,18 +291,17 @@ def make_vector_env(args, n_envs):
     if study:
         return study.make_vector_env(args, n_envs, make_env)
     functions, mode = [lambda: make_env(args)] * n_envs, gym.vector.AutoresetMode.SAME_STEP
+    # copy=False: obs is one array, overwritten by each step
     return gym.vector.SyncVectorEnv(functions, copy=False, autoreset_mode=mode)
 
 
 # --- Collecting
-
-
 def exploration(agent, noise, args):
     """Returns act(obs (n_envs, obs_dim), t) -> actions (n_envs, action_dim), for one rollout.
 
-    Another object can take the noise's place. It needs sample(n_steps), a tensor (n_steps, n_envs,
-    action_dim) in which each value by itself is Gaussian with mean 0 and variance 1, and, for
-    checkpoints, state_dict() and load_state_dict(state).
+    You can replace the noise by another object. It needs sample(n_steps), which returns a tensor
+    (n_steps, n_envs, action_dim) in which each value by itself is Gaussian with mean 0 and variance
+    1, and, for checkpoints, state_dict() and load_state_dict(state).
     """
     mean, std = numpy_policy(agent.actor_mean), agent.std().detach().cpu().numpy()
     shape = (args.n_steps, args.n_envs, len(std))
@@ -301,7 +312,7 @@ def exploration(agent, noise, args):
 
 @torch.no_grad()
 def collect(agent, act, envs, last_obs, so_far, args, bar):
-    """Takes n_steps in each environment, going on from last_obs, and makes a batch of them.
+    """Takes n_steps in each environment, starting from last_obs, and makes a batch of them.
 
     last_obs: (n_envs, obs_dim). so_far: (2, n_envs), return and length up to now of each
     environment's episode; it is updated. Returns the batch, (obs, actions, logprobs, advantages,
@@ -315,8 +326,8 @@ def collect(agent, act, envs, last_obs, so_far, args, bar):
     obs[0] = last_obs
     for t in range(args.n_steps):
         actions[t] = act(obs[t], t)
-        # The environment gets the clipped action. The one stored, to learn from, is the unclipped:
-        # its log-probability is a Gaussian's, that of the clipped one is not.
+        # The environment gets the clipped action. We store the unclipped one: its log-probability
+        # is a Gaussian's, that of the clipped one is not.
         clipped = np.clip(actions[t], space.low, space.high)
         obs[t + 1], rewards[t], terminated, truncated, infos = envs.step(clipped)
         dones[t] = terminated | truncated
@@ -330,26 +341,23 @@ def collect(agent, act, envs, last_obs, so_far, args, bar):
         bar.update(args.n_envs)
     for name, array in {"observations": obs, "actions": actions, "rewards": rewards}.items():
         if not np.isfinite(array).all():
-            t, i, *_ = np.argwhere(~np.isfinite(array))[0]
-            raise FloatingPointError(f"{name} {array[t, i]} in environment {i} of {args.env_id}, "
-                                     f"{args.n_steps - t} steps before step {bar.n}")  # fmt: skip
+            raise FloatingPointError(f"{args.env_id}: {name} not finite, before step {bar.n}")
 
     # Only the mean action is needed to act. The log-probabilities and values are computed here, for
     # all steps in one go: much quicker than one by one, and the same, as nothing has learned since.
-    batch_obs = torch.as_tensor(obs[:-1], device=args.device).flatten(0, 1)
-    batch_actions = torch.as_tensor(actions, device=args.device).flatten(0, 1)
+    tensor = functools.partial(torch.as_tensor, device=args.device)
+    batch_obs, batch_actions = tensor(obs[:-1]).flatten(0, 1), tensor(actions).flatten(0, 1)
     logprobs, _, values = agent(batch_obs, batch_actions)
-    last_values = agent.critic(torch.as_tensor(obs[-1], device=args.device))
-    last_values = last_values.squeeze(-1).cpu().numpy()
+    last_values = agent.critic(tensor(obs[-1])).squeeze(-1).cpu().numpy()
     if args.bootstrap_timeouts and timeouts:
         # A time limit is not the end of the task: the episode would have gone on from its final
         # observation, and what would have followed is worth V(final observation).
         steps, indices, final_obs = zip(*timeouts, strict=True)
-        final_obs = torch.as_tensor(np.stack(final_obs), device=args.device)
-        rewards[steps, indices] += args.gamma * agent.critic(final_obs).squeeze(-1).cpu().numpy()
+        final_values = agent.critic(tensor(np.stack(final_obs))).squeeze(-1).cpu().numpy()
+        rewards[steps, indices] += args.gamma * final_values
     values_2d = values.view(rewards.shape).cpu().numpy()
     targets = compute_gae(rewards, values_2d, dones, last_values, args.gamma, args.gae_lambda)
-    advantages, returns = (torch.as_tensor(x, device=args.device).flatten() for x in targets)
+    advantages, returns = (tensor(x).flatten() for x in targets)
     batch = batch_obs, batch_actions, logprobs, advantages, returns, values
     return batch, obs[-1], episodes
 
@@ -371,8 +379,6 @@ def compute_gae(rewards, values, dones, last_values, gamma, gae_lambda):
 
 
 # --- Learning
-
-
 def trainable(agent):
     return [p for p in agent.parameters() if p.requires_grad]
 
@@ -385,7 +391,7 @@ def ppo_loss(agent, minibatch, args):
     """PPO's clipped objective (Schulman et al. 2017).
 
     minibatch: obs (batch, obs_dim), actions (batch, action_dim), logprobs, advantages, returns and
-    values (batch,). Returns the loss and a dict of what is to be logged.
+    values (batch,). Returns the loss and a dict of metrics to log.
     """
     obs, actions, old_logprobs, advantages, returns, _ = minibatch  # old values: for value clipping
     logprobs, entropy, values = agent(obs, actions)
@@ -405,13 +411,14 @@ def ppo_loss(agent, minibatch, args):
 
 
 def loss_gradients(loss_function, agent, minibatch, args):
-    """Gradients of the loss, scaled down to --max-grad-norm, and what is to be logged.
+    """Returns the gradients of the loss, scaled down to --max-grad-norm, and metrics to log.
 
     This is loss.backward() and clip_grad_norm_(). In this form torch.compile makes one graph of
-    both and of the loss: a quarter of the time of ordinary PyTorch (--no-compile). What is not a
-    tensor is a constant of the graph. If it changes, the graph is compiled anew, which takes long.
+    both and of the loss: a third of the time of ordinary PyTorch (--no-compile). What is not a
+    tensor is a constant of the graph. If it changes, the graph is compiled again: 10 seconds.
     """
     loss, metrics = loss_function(agent, minibatch, args)
+    # materialize_grads: zeros for parameters that the loss does not use
     grads = torch.autograd.grad(loss, trainable(agent), materialize_grads=True)
     norm = sum(grad.square().sum() for grad in grads).sqrt()
     scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
@@ -420,7 +427,7 @@ def loss_gradients(loss_function, agent, minibatch, args):
 
 
 def learn(agent, optimizer, batch, gradients, args):
-    """Several epochs of minibatches. Returns what is to be logged, averaged over minibatches."""
+    """Several epochs of minibatches. Returns metrics to log, averaged over the minibatches."""
     params, all_metrics = trainable(agent), []
     for _ in range(args.n_epochs):
         permutation = torch.randperm(len(batch[0])).to(args.device)
@@ -429,7 +436,7 @@ def learn(agent, optimizer, batch, gradients, args):
             minibatch = [x[start : start + args.batch_size] for x in shuffled]
             grads, metrics = gradients(agent, minibatch, args)
             for parameter, grad in zip(params, grads, strict=True):
-                parameter.grad = grad
+                parameter.grad = grad  # replaces the old one: no zero_grad()
             optimizer.step()
             all_metrics.append(metrics)
     return {name: torch.stack([m[name] for m in all_metrics]).mean() for name in all_metrics[0]}
@@ -447,25 +454,22 @@ def compiled(function):
         try:
             return graph(*arguments)
         except Exception as error:  # no compiler, an edit that cannot be compiled, ...
-            if graph is function:
+            if graph is function:  # not the compiler's fault
                 raise
             graph, reason = function, str(error).strip().split("\n")[0][:120]
-            tqdm.write(f"note: going on without torch.compile, 4 times as slow in the update: "
-                       f"{reason}", file=sys.stderr)  # fmt: skip
+            tqdm.write(f"note: no torch.compile, so updates are slow: {reason}", file=sys.stderr)
             return function(*arguments)
 
     return call
 
 
 # --- Evaluating
-
-
 @torch.random.fork_rng(devices=[])  # an environment that draws from torch must not change training
 def evaluate(policy, envs, seeds, max_steps=1_000_000):
     """Plays one episode of the policy in each environment: returns and lengths, (n_envs,) each.
 
-    Returns are undiscounted. An environment whose episode has ended steps on until the longest has:
-    what it does then is not counted.
+    Returns are undiscounted. Where an episode has ended, its environment keeps stepping until all
+    have ended; what it does then is not counted.
     """
     space, (obs, _) = envs.single_action_space, envs.reset(seed=seeds)
     returns, lengths = np.zeros(envs.num_envs), np.zeros(envs.num_envs)
@@ -473,41 +477,32 @@ def evaluate(policy, envs, seeds, max_steps=1_000_000):
     for _ in range(max_steps):
         actions = np.clip(policy(obs), space.low, space.high)
         obs, rewards, terminated, truncated, _ = envs.step(actions)
-        returns += rewards * unfinished
+        returns += np.where(unfinished, rewards, 0)
         lengths += unfinished
         unfinished &= ~(terminated | truncated)
         if not unfinished.any():
             return returns, lengths
-    raise RuntimeError(f"an episode has not ended after {max_steps} steps: --max-episode-steps N "
-                       "sets a limit")  # fmt: skip
+    raise RuntimeError(f"no end of an episode in {max_steps} steps: set --max-episode-steps")
 
 
-def evaluate_due(run, agent, envs, eval_envs, global_step, args, bar):
-    """Makes the evaluations that are due before the next update.
+def evaluate_due(run, agent, acting, eval_envs, global_step, args, bar):
+    """Makes the evaluations that fall before the next update.
 
     An evaluation at step t is of the policy that acts at step t. With 8,192 steps per update, the
     policy of step 8,192 acts until step 16,383, so it is the one evaluated for step 10,240.
     """
-    policy, next_update = None, global_step + args.n_steps * args.n_envs
-    while run.next_eval < next_update and run.next_eval <= args.total_timesteps:
-        if policy is None or not args.eval_once_per_policy:
-            policy = numpy_policy(agent.actor_mean)
-            seeds = make_seeds(args.eval_episodes, args.seed, 2, run.next_eval)
+    policy, end = numpy_policy(agent.actor_mean), global_step + args.n_steps * args.n_envs
+    due = range(run.next_eval, min(end, args.total_timesteps + 1), args.eval_freq)
+    for step in due:
+        if step == due[0] or not args.eval_once_per_policy:
+            seeds = make_seeds(args.eval_episodes, args.seed, 2, step)
             returns, lengths = evaluate(policy, eval_envs, seeds)
-        run.add_evaluation(returns, lengths, acting_state(agent, envs))
+        run.add_evaluation(step, returns, lengths, acting)
         bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
-        seed_global_generators(args.seed, 3, global_step)  # as if evaluations had drawn nothing
-
-
-def acting_state(agent, envs):
-    """All that acts: the networks, and the statistics of --normalize-obs."""
-    normalization = envs.state_dict() if hasattr(envs, "state_dict") else {}
-    return {"agent": agent.state_dict(), "normalization": normalization}
+        seed_global_generators(args.seed, 3, global_step)  # whatever evaluations have drawn
 
 
 # --- The run's folder
-
-
 def run_path(args):
     """Path of a run's folder: it shows the experiment, environment, beta, n_envs and seed."""
     beta = "beta_" + ("auto" if args.beta_auto else "_".join(f"{b:g}" for b in args.beta))
@@ -516,20 +511,18 @@ def run_path(args):
     return path / f"n_envs_{args.n_envs}" / f"seed_{args.seed}"
 
 
-@contextlib.contextmanager
-def locked(path):
-    """Makes the folder, which no other process can have meanwhile. Exit code 3 if one has it."""
+def lock(path):
+    """Makes the folder and locks it. Ends with exit code 3 if another process has it."""
     path.mkdir(parents=True, exist_ok=True)
     try:
-        with filelock.FileLock(path / "lock", timeout=0, fallback_to_soft=False):
-            yield
+        return filelock.FileLock(path / "lock", fallback_to_soft=False).acquire(timeout=0)
     except filelock.Timeout:
         print(f"another process works on {path}: choose another --seed or --exp-name")
         sys.exit(3)
 
 
 def replace_file(path, write):
-    """Writes a file beside, by write(temporary path), then renames it: all of it, or nothing."""
+    """write(path) writes to a temporary file, which is then renamed: it is never half written."""
     temporary = path.with_name(path.name + ".tmp")
     write(temporary)
     os.replace(temporary, path)
@@ -542,62 +535,59 @@ def write_json(path, value):
 def git_commit():
     """Commit of this file, with "-dirty" where the checkout differs from it; None without git."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    with contextlib.suppress(OSError):
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
-        return done.stdout.strip() or None
-
-
-# Arguments that do not change the result: they may differ between a run and its --resume
-FREE_ARGUMENTS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "track"}
+    try:
+        return subprocess.check_output(command, cwd=Path(__file__).parent, text=True).strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
 
 
 class Run:
-    """The folder of a run: what it leaves behind, and what --resume goes on from.
+    """The folder of a run: what it leaves behind, and what --resume continues from.
 
-    Attributes: `complete`, whether there is nothing to do; `checkpoint`, a dict to go on from, or
-    None; `next_eval`, the step of the next evaluation. Nothing is changed before start().
+    Attributes: `complete`, whether there is nothing to do; `checkpoint`, a dict to continue from,
+    or None; `next_eval`, the step of the next evaluation. Nothing is changed before start().
     """
+
+    # These do not change the result: they may differ between a run and its --resume
+    FREE_ARGUMENTS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "track"}
 
     def __init__(self, args):
         self.args, self.path, self.checkpoint = args, run_path(args), None
         self.next_eval, self.best_return = args.eval_freq, -math.inf
         self.start_time, self.saved_time, self.logged_step = time.time(), 0.0, 0
         self.complete = (self.path / "summary.json").exists() and not args.overwrite
-        unfinished = (self.path / "checkpoint.pt").exists() and not (
-            args.overwrite or self.complete
-        )
-        if self.complete or unfinished:
+        has_checkpoint = (self.path / "checkpoint.pt").exists() and not args.overwrite
+        if self.complete or has_checkpoint:
             old = json.loads((self.path / "config.json").read_text())["args"]
-            new = json.loads(json.dumps(vars(args)))
-            for name in sorted(new.keys() - FREE_ARGUMENTS):
-                if old.get(name) != new[name]:
+            for name, value in vars(args).items():
+                if old.get(name) != value and name not in self.FREE_ARGUMENTS:
                     raise FileExistsError(f"{self.path} holds a run with {name} {old.get(name)}, "
-                        f"not {new[name]}: choose another --exp-name, or --overwrite")  # fmt: skip
-        if unfinished and not args.resume:
-            raise FileExistsError(f"{self.path} holds an unfinished run: --resume continues it, "
-                                  "--overwrite starts again")  # fmt: skip
-        if unfinished:
-            self.checkpoint = torch.load(self.path / "checkpoint.pt", weights_only=True)
+                        f"not {value}: choose another --exp-name, or --overwrite")  # fmt: skip
+        if has_checkpoint and not self.complete:
+            if not args.resume:
+                raise FileExistsError(f"{self.path} is unfinished: use --resume or --overwrite")
+            file = self.path / "checkpoint.pt"
+            self.checkpoint = torch.load(file, map_location="cpu", weights_only=True)
 
     def start(self):
         """Cuts the files back to the checkpoint, or clears the folder; opens TensorBoard's file."""
-        rows, purge_step = ["step,return_mean,return_std,length_mean\n"], None
-        old_files = [*self.path.glob("*.tmp")]  # of a kill while one was written
+        stale = ["*.tmp"]  # left by a process that was killed while writing
+        if not self.checkpoint:
+            stale += ["summary.json", "checkpoint.pt", "best.pt", "events.out.tfevents.*"]
+        for pattern in stale:
+            for file in self.path.glob(pattern):
+                file.unlink()
         if self.checkpoint:
             self.logged_step = self.checkpoint["global_step"]
             self.next_eval = self.checkpoint["next_eval"]
             self.best_return = self.checkpoint["best_return"]
-            self.start_time -= self.checkpoint["wall_seconds"]
-            purge_step = self.logged_step  # TensorBoard hides points from here on
+            self.start_time -= self.checkpoint["wall_seconds"]  # so wall_seconds continues
             rows = (self.path / "evaluations.csv").read_text().splitlines(keepends=True)
-            rows = rows[: self.next_eval // self.args.eval_freq]  # the first is the header
+            rows = rows[
+                : self.next_eval // self.args.eval_freq
+            ]  # the header, and a row per earlier evaluation
         else:
-            names = ["summary.json", "checkpoint.pt", "best.pt"]
-            old_files += [self.path / name for name in names]
-            old_files += self.path.glob("events.out.tfevents.*")
-        for file in old_files:
-            file.unlink(missing_ok=True)
-        if not self.checkpoint:
+            rows = ["step,return_mean,return_std,length_mean\n"]
             versions = {x.name: x.version for x in importlib.metadata.distributions()}
             config = {"args": vars(self.args), "git_commit": git_commit(), "versions": versions}
             write_json(self.path / "config.json", config)
@@ -606,27 +596,25 @@ class Run:
             import wandb
 
             wandb.init(project="ppo_colored_noise", name=str(self.path), sync_tensorboard=True)
-        self.writer = SummaryWriter(str(self.path), purge_step=purge_step)
+        # TensorBoard hides what an earlier process has logged from purge_step on
+        self.writer = SummaryWriter(str(self.path), purge_step=self.logged_step or None)
         self.log_time = time.time()
 
-    def add_evaluation(self, returns, lengths, acting):
-        """Writes a row of evaluations.csv, for the step next_eval. returns, lengths: (n_episodes,).
-
-        acting: the state_dicts of all that acted. best.pt keeps those of the best mean return.
-        """
-        step, mean, std, length = self.next_eval, returns.mean(), returns.std(), lengths.mean()
+    def add_evaluation(self, step, returns, lengths, acting):
+        """Writes a row of evaluations.csv; and best.pt, what acted, if no return was better."""
+        mean, std, length = returns.mean(), returns.std(), lengths.mean()
         if not np.isfinite(mean):
             raise FloatingPointError(f"return {mean} in {self.args.env_id}, evaluated at {step}")
         with open(self.path / "evaluations.csv", "a") as file:
             file.write(f"{step},{mean:.9g},{std:.9g},{length:.9g}\n")
         if mean > self.best_return:
             self.best_return = mean.item()
-            best = {**acting, "step": step, "return_mean": self.best_return}
+            best = {name: part.state_dict() for name, part in acting.items()}
+            best |= {"step": step, "return_mean": self.best_return}
             replace_file(self.path / "best.pt", lambda file: torch.save(best, file))
-        self.writer.add_scalar("evaluation/return_mean", mean, step)
-        self.writer.add_scalar("evaluation/return_std", std, step)
-        self.writer.add_scalar("evaluation/length_mean", length, step)
-        self.next_eval += self.args.eval_freq
+        for name, value in ("return_mean", mean), ("return_std", std), ("length_mean", length):
+            self.writer.add_scalar(f"evaluation/{name}", value, step)
+        self.next_eval = step + self.args.eval_freq
 
     def add_update(self, step, losses, episodes):
         """Logs an update: its losses, the speed, and the (return, length) means of episodes."""
@@ -640,9 +628,11 @@ class Run:
             self.writer.add_scalar(tag, value, step)
         self.logged_step, self.log_time = step, time.time()
 
-    def save_checkpoint(self, **state):
-        """Writes checkpoint.pt: tensors and plain values, all that --resume needs."""
+    def save_checkpoint(self, parts, global_step, torch_rng):
+        """Writes checkpoint.pt, all that --resume needs. parts: objects that have a state_dict."""
         self.writer.flush()
+        state = {name: part.state_dict() for name, part in parts.items()}
+        state |= {"global_step": global_step, "torch_rng": torch_rng}
         state |= {"next_eval": self.next_eval, "best_return": self.best_return}
         state["wall_seconds"] = time.time() - self.start_time
         replace_file(self.path / "checkpoint.pt", lambda file: torch.save(state, file))
@@ -661,8 +651,6 @@ class Run:
 
 
 # --- The whole run
-
-
 def make_seeds(n, *key):
     """n independent seeds below 2^32, determined by the integers of the key."""
     return np.random.SeedSequence(key).generate_state(n).tolist()
@@ -677,18 +665,17 @@ def seed_global_generators(*key):
 
 def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=learn,
          make_optimizer=make_optimizer):  # fmt: skip
-    """Trains and evaluates as `args` say. The other arguments are what another method replaces."""
+    """Trains and evaluates as `args` say. Other methods replace the other arguments."""
     torch.set_num_threads(1)
     seed_global_generators(args.seed, 3, 0)  # before environments are made: some draw then
     envs, eval_envs = make_vector_env(args, args.n_envs), make_vector_env(args, args.eval_episodes)
     if args.normalize_obs or args.normalize_rewards:
         envs = study.NormalizedVectorEnv(envs, args)
         eval_envs = envs.frozen(eval_envs)
-    with contextlib.closing(envs), contextlib.closing(eval_envs), locked(run_path(args)):
+    with contextlib.closing(envs), contextlib.closing(eval_envs), lock(run_path(args)):
         run = Run(args)
         if run.complete:
-            print(f"nothing was run: {run.path} holds this run, complete. --overwrite runs it "
-                  "again, --exp-name NAME keeps both")  # fmt: skip
+            print(f"nothing was run, {run.path} is complete: use --overwrite or --exp-name NAME")
             return
         obs_dim = envs.single_observation_space.shape[0]
         action_dim = envs.single_action_space.shape[0]
@@ -701,15 +688,18 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         gradients = functools.partial(loss_gradients, loss)
         gradients = compiled(gradients) if args.compile else gradients
 
+        acting = {"agent": agent}  # for best.pt
+        if hasattr(envs, "state_dict"):
+            acting["normalization"] = envs  # the statistics of --normalize-obs and -rewards
+        saved = {**acting, "optimizer": optimizer, "noise": noise}  # for checkpoint.pt
         global_step = 0
         if run.checkpoint:
             global_step = run.checkpoint["global_step"]
-            agent.load_state_dict(run.checkpoint["agent"])
-            optimizer.load_state_dict(run.checkpoint["optimizer"])
-            noise.load_state_dict(run.checkpoint["noise"])
             torch.set_rng_state(run.checkpoint["torch_rng"])
-            if run.checkpoint["normalization"]:
-                envs.load_state_dict(run.checkpoint["normalization"])
+            groups = optimizer.state_dict()["param_groups"]  # the learning rate as it is now
+            run.checkpoint["optimizer"]["param_groups"] = groups
+            for name, part in saved.items():
+                part.load_state_dict(run.checkpoint[name])
         run.start()
         # The state of environments cannot be saved: after a resume they begin new episodes
         seed_global_generators(args.seed, 3, global_step)
@@ -718,16 +708,17 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
         episodes, so_far = [], np.zeros((2, args.n_envs))
 
-        where = "EnvPool's, not from make_env()" if args.envpool else "from make_env()"
-        print(f"{run.path}: environments are {where}; after Ctrl-C, --resume goes on")
+        where = "EnvPool's: make_env() is not called" if args.envpool else "from make_env()"
+        print(f"{run.path}: environments are {where}. After Ctrl-C, --resume continues")
         bar = tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True,
                    mininterval=0.5 if sys.stderr.isatty() else 60)  # fmt: skip
         while True:
-            evaluate_due(run, agent, envs, eval_envs, global_step, args, bar)
+            evaluate_due(run, agent, acting, eval_envs, global_step, args, bar)
             if global_step == total:
                 break
             if args.anneal_lr:
-                optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - global_step / total)
+                for group in optimizer.param_groups:
+                    group["lr"] = args.learning_rate * (1 - global_step / total)
             act = exploration(agent, noise, args)
             batch, obs, ended = collect(agent, act, envs, obs, so_far, args, bar)
             losses = learn(agent, optimizer, batch, gradients, args)
@@ -736,7 +727,9 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
                 raise FloatingPointError("training diverged: lower --learning-rate")
 
             episodes += ended
-            if (global_step - run.logged_step) * 1000 >= args.total_timesteps:  # 1000 points
+            if (
+                global_step - run.logged_step
+            ) * 1000 >= args.total_timesteps:  # 1000 points or less
                 *_, returns, values = batch
                 unexplained = (returns - values).var() / returns.var().clamp(min=1e-12)
                 losses |= {"explained_variance": 1 - unexplained, "std": agent.std().mean().item()}
@@ -744,9 +737,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
                 run.add_update(global_step, losses, episodes)
                 episodes = []
             if time.time() > run.saved_time + 5 or global_step == total:
-                state = {"optimizer": optimizer.state_dict(), "noise": noise.state_dict()}
-                state |= acting_state(agent, envs) | {"torch_rng": torch.get_rng_state()}
-                run.save_checkpoint(global_step=global_step, **state)
+                run.save_checkpoint(saved, global_step, torch_rng=torch.get_rng_state())
         bar.close()
         run.finish(global_step)
 

@@ -70,7 +70,7 @@ def load_policy(run, best=False, beta=None, seed=1, render_mode=None):
     # What an older run does not have has its default
     run_args = argparse.Namespace(**{**vars(ppo.parse_args([])), **recorded})
     saved = torch.load(Path(run) / ("best.pt" if best else "checkpoint.pt"), weights_only=True)
-    env = make_env(run_args, saved["normalization"], render_mode)
+    env = make_env(run_args, saved.get("normalization"), render_mode)
     space = env.single_action_space
     make_agent = methods.GSDEAgent if run_args.method == "gsde" else ppo.Agent
     agent = make_agent(env.single_observation_space.shape[0], space.shape[0])

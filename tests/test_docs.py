@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import re
+import shlex
 import subprocess
 import sys
 import types
@@ -62,12 +63,15 @@ def test_links(page):
         assert not anchor or anchor in slugs, target
 
 
-def test_first_command(tmp_path):
-    command = blocks(section(README, "Two commands"), "bash")[0].strip()
-    install, train = command.split(" && ")
-    assert install == "pip install -r requirements.txt"  # .ci/run does it
-    assert "final return" in run(f"{train} {TRAINING}", tmp_path)
-    assert (tmp_path / "runs/ppo_colored_continuous/MountainCarContinuous-v0/beta_0.5").is_dir()
+def test_commands_have_flags_that_there_are():
+    found = 0
+    for page in PAGES:
+        for line in "\n".join(blocks(page.read_text(), "bash")).replace("\\\n", "").splitlines():
+            *_, flags = line.partition("python ppo_colored_continuous.py")
+            if flags:
+                ppo.parse_args(shlex.split(flags, comments=True))
+                found += 1
+    assert found >= 2
 
 
 def test_the_lines_that_are_the_paper_are_in_the_script():
@@ -224,10 +228,10 @@ def test_look_at_noise():
 
 
 def test_why_it_works():
-    """With three of the twenty seeds."""
+    """With one of the twenty seeds."""
     code, spectrum = blocks(section(LESSON, "3. Why it works"), "python")
-    lines = printed(code.replace("range(1, 21)", "range(1, 4)")).splitlines()
-    assert [int(re.search(r"found in (\d+)", line)[1]) for line in lines] == [0, 3, 3, 3]
+    lines = printed(code.replace("range(1, 21)", "range(1, 2)")).splitlines()
+    assert [int(re.search(r"found in (\d+)", line)[1]) for line in lines] == [0, 1, 1, 1]
     power = [float(line.split()[1]) for line in printed(spectrum).splitlines()]
     assert power == [1.0, 3.1, 5.3, 1.6]
 

@@ -202,7 +202,7 @@ def test_parameters_after_steps_of_adam(compile, capsys):
     after = flat(agent, sb3.policy)
     assert (after - before).abs().max() > 2e-3
     torch.testing.assert_close(parameters(agent), after, rtol=1e-4, atol=2e-5)
-    assert "going on without" not in capsys.readouterr().err  # it did compile
+    assert "no torch.compile" not in capsys.readouterr().err  # it did compile
 
 
 @pytest.mark.parametrize("gamma, gae_lambda", [(0.99, 0.95), (1.0, 0.0), (0.9, 1.0)])
@@ -363,7 +363,8 @@ def test_same_seed_same_evaluations_whatever_an_environment_draws_from(train, ti
     def evaluations(flags):
         random.seed(time.time())
         np.random.seed(time.time_ns() % 2**32)  # noqa: NPY002
-        folder = train(f"{tiny} --env-id Draws-v0 --overwrite {flags}")
+        flags += " --total-timesteps 1536 --env-id Draws-v0 --overwrite"
+        folder = train(f"{tiny} {flags}")
         return (folder / "evaluations.csv").read_text()
 
     first = evaluations("--seed 5")
@@ -389,7 +390,7 @@ def assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=0):
 @pytest.mark.parametrize("beta, reached", [("0.5", True), ("0", False)])
 def test_mountain_car_needs_colored_noise(train, beta, reached):
     """With larger learning rate and minibatches than the paper's, in 65,536 steps."""
-    flags = "--learning-rate 3e-3 --batch-size 512 --total-timesteps 65536 --eval-freq 8192 "
+    flags = "--learning-rate 3e-3 --batch-size 512 --total-timesteps 65536 --eval-freq 16384 "
     folder = train(f"{flags} --eval-episodes 5 --beta {beta}")
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["final_return"] > 85 if reached else summary["final_return"] < 1
@@ -502,7 +503,7 @@ def test_resume_goes_on_from_the_checkpoint(train, tiny, tmp_path, read_evaluati
         first.append(parameters(agent))
         return ppo.learn(agent, *rest)
 
-    with pytest.raises(FileExistsError, match="--resume continues it, --overwrite starts again"):
+    with pytest.raises(FileExistsError, match="unfinished: use --resume or --overwrite"):
         train(tiny)
     with pytest.raises(FileExistsError, match="gamma 0.99, not 0.9: choose another --exp-name"):
         train(f"{tiny} --gamma 0.9 --resume")
@@ -556,7 +557,7 @@ def interrupt(*_):
         ("--n-envs many", "invalid int value"),
         ("--beta 0.5 auto", "auto is one value"),
         ("--resume --overwrite", "choose one"),
-        ("--n-envs 64 --total-timesteps 100000", "first update, after 64 * 2048 steps"),
+        ("--n-envs 64 --total-timesteps 100000", "no update before the last evaluation"),
         ("--env-kwargs goal=3", "env-kwargs"),
     ],
 )
@@ -588,13 +589,9 @@ gym.register("Faulty-v0", Faulty, max_episode_steps=20)
 @pytest.mark.parametrize("what", ["observations", "rewards"])
 def test_what_is_not_finite_is_named(train, tiny, what, monkeypatch):
     monkeypatch.setattr(Faulty, "steps", 0)
-    message = f"{what} (nan|inf).* in environment 1 of Faulty-v0"
-    with pytest.raises(FloatingPointError, match=message if what == "rewards" else what):
-        train(
-            f"{tiny} --env-id Faulty-v0 --env-kwargs {json.dumps({'what': what})}".replace(
-                ": ", ":"
-            )
-        )
+    with pytest.raises(FloatingPointError, match=f"Faulty-v0: {what} not finite"):
+        kwargs = json.dumps({"what": what}).replace(" ", "")
+        train(f"{tiny} --env-id Faulty-v0 --env-kwargs {kwargs}")
 
 
 def test_a_diverged_run_says_so(train, tiny):
@@ -638,11 +635,11 @@ assert ppo.study is None
 for env_id in ("Pendulum-v1", "dm_control/pendulum-swingup-v0", "my_env:MyEnv-v0"):
     args = ppo.parse_args(["--env-id", env_id, *{tiny.split()}, "--eval-episodes", "1"])
     ppo.main(args)
-    folder = ppo.run_path(args)
-    (folder / "summary.json").unlink()
-    args.resume = True
-    ppo.main(args)
-    assert (folder / "summary.json").exists()
+folder = ppo.run_path(args)
+(folder / "summary.json").unlink()
+args.resume = True
+ppo.main(args)
+assert (folder / "summary.json").exists()
 for flags in (["--normalize-obs"], ["--envpool"]):
     try:
         ppo.parse_args(flags)
@@ -658,13 +655,6 @@ for flags in (["--normalize-obs"], ["--envpool"]):
     command = [sys.executable, "ppo_colored_continuous.py", "--env-id", "PointUMaze-v1"]
     done = subprocess.run(command, **how)
     assert done.returncode == 1 and "PointUMaze" in done.stderr.splitlines()[-1]
-
-
-def test_without_a_compiler_it_says_so_once_and_goes_on(start, tiny, tmp_path):
-    process = start(tiny.replace("--no-compile", "--compile"), env={**os.environ, "CXX": "none",
-                    "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache")})  # fmt: skip
-    _, err = process.communicate()
-    assert process.returncode == 0 and err.count("going on without torch.compile") == 1
 
 
 # --- Edits that students make, each in a copy of the script: they take effect, or fail loudly
@@ -796,7 +786,7 @@ def test_print_and_mistakes_in_the_loss(run_edited, capsys, flags):
     run_edited((line, f'{line}    print("ratio", ratio.mean())\n'), flags=flags)
     out, err = capsys.readouterr()
     assert out.count("ratio") >= 16  # 4 updates of 4 minibatches
-    assert ("going on without torch.compile" in err) == (flags == "--compile")
+    assert ("no torch.compile" in err) == (flags == "--compile")
     with pytest.raises(AttributeError, match="expp"):
         run_edited((line, line.replace("exp", "expp")), flags=flags)
 

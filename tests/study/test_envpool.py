@@ -109,7 +109,7 @@ def test_each_step_is_the_same(env_id):
     as many. The door does not show its whole state: it is compared over the first 25 steps of
     episodes that start in the same state.
     """
-    n_envs, pool, env = 6, make_pool(env_id, 6), make_single(env_id)
+    n_envs, pool, env = 4, make_pool(env_id, 4), make_single(env_id)
     assert pool.single_observation_space == env.observation_space
     actions = pool.single_action_space
     assert actions == gym.spaces.Box(env.action_space.low, env.action_space.high)  # float32
@@ -138,10 +138,10 @@ def test_each_step_is_the_same(env_id):
 
 @pytest.mark.parametrize("env_id", ENVPOOL_TASKS)
 def test_episodes_start_the_same_way(env_id):
-    """Kolmogorov-Smirnov test of each dimension of 200 first observations; finds 0.6 std."""
-    starts, _ = make_pool(env_id, 200, "--threads 1").reset(seed=list(range(200)))
+    """Kolmogorov-Smirnov test of each dimension of 100 first observations."""
+    starts, _ = make_pool(env_id, 100).reset(seed=list(range(100)))
     env = make_single(env_id)
-    theirs = [env.reset(seed=i)[0] for i in range(200)]
+    theirs = [env.reset(seed=i)[0] for i in range(100)]
     for x, y in zip(np.round(starts, 5).T, np.round(theirs, 5).T, strict=True):
         assert stats.ks_2samp(x, y).pvalue > 1e-4
 
@@ -215,20 +215,23 @@ def test_models_without_what_is_only_seen_move_the_same(env_id):
 
 
 MEMORY = """
-import argparse, resource
+import argparse
 from study.environments import EnvPoolVectorEnv
+made = []
 for env_id in ("dm_control/cheetah-run-v0", "door-v0"):
     args = argparse.Namespace(env_id=env_id, max_episode_steps=None, env_kwargs=None, threads=1)
-    peaks = []
+    pages = []
     for n_envs in (1, 31):
-        EnvPoolVectorEnv(args, n_envs).reset(seed=list(range(n_envs)))
-        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    print(peaks[1] - peaks[0])
+        made.append(EnvPoolVectorEnv(args, n_envs))
+        made[-1].reset(seed=list(range(n_envs)))
+        pages.append(int(open("/proc/self/statm").read().split()[1]))
+    print((pages[1] - pages[0]) * 4096 / 1e6)
 """
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_an_environment_takes_little_memory():
-    """30 of them; they took 380 and 240 MB with what only pictures show."""
+    """31 of them; they took 380 and 240 MB with what only pictures show."""
     command, root = [sys.executable, "-c", MEMORY], Path(ppo.__file__).parent
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     cheetahs, doors = map(float, done.stdout.split())
