@@ -1,5 +1,7 @@
 """The script: against Stable-Baselines3, as a user runs it, and as a student edits it."""
 
+import errno
+import fcntl
 import json
 import os
 import random
@@ -329,6 +331,12 @@ def test_evaluation_counts_whole_episodes_once():
     assert returns.tolist() == [6, 15, 1] and lengths.tolist() == [3, 5, 1]
 
 
+def test_the_time_limit_of_an_environment_holds_however_long():
+    envs = ppo.make_vector_env(parse("--env-id CountTerminated-v0"), 1)
+    _, lengths = ppo.evaluate(lambda obs: np.zeros((1, 1), np.float32), envs, [20_000])
+    assert lengths == [20_000]
+
+
 def test_dict_observations_are_flattened_to_float32_in_order():
     envs = ppo.make_vector_env(parse("--env-id dm_control/walker-run-v0 --no-envpool"), 1)
     obs, _ = envs.reset(seed=[3])
@@ -546,6 +554,17 @@ def test_a_second_process_is_kept_out_and_the_lock_goes_with_the_run(start, trai
     assert train(f"{tiny} --overwrite") == path
 
 
+def test_without_flock_there_is_no_lock_by_existence(train, tiny, tmp_path, monkeypatch):
+    """Such a lock would stay behind a killed process for ever."""
+
+    def no_flock(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", no_flock)
+    with pytest.raises((OSError, NotImplementedError), match="flock|not implemented"):
+        train(tiny)
+
+
 def interrupt(*_):
     raise KeyboardInterrupt
 
@@ -597,6 +616,11 @@ def test_what_is_not_finite_is_named(train, tiny, what, monkeypatch):
 def test_a_diverged_run_says_so(train, tiny):
     with pytest.raises(FloatingPointError, match="diverged: lower --learning-rate"):
         train(f"{tiny} --learning-rate 1e30")
+
+
+def test_a_module_that_registers_another_is_named_by_its_file(train, tiny):
+    with pytest.raises(LookupError, match=r"tqdm.__init__.py, registers no MyEnv-v0"):
+        train(f"{tiny} --env-id tqdm:MyEnv-v0")
 
 
 def test_discrete_actions_are_refused(train, tiny):
