@@ -519,6 +519,8 @@ def lock(path):
     except filelock.Timeout:
         print(f"another process works on {path}: choose another --seed or --exp-name")
         sys.exit(3)
+    except OSError as error:
+        raise OSError(f"cannot lock {path}: choose a --runs-dir that has locks") from error
 
 
 def replace_file(path, write):
