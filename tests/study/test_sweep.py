@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+import ppo_colored_continuous as ppo
 from study import sweep
 from study.protocol import PRESETS
 
@@ -103,3 +104,25 @@ def test_wrong_usage(arguments, capsys):
 def test_nothing_slow_is_imported():
     code = "import sys, study.sweep; print(*{'torch', 'gymnasium', 'numpy'} & sys.modules.keys())"
     assert subprocess.check_output([sys.executable, "-c", code], cwd=sweep.ROOT) == b"\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        'main --envs "Point4Rooms-v1 cheetah-run my_env:X-v0" --betas "-1 0.5 auto" --n-envs 8',
+        "vanilla --n-envs 1 --seeds 3",
+        "n_steps --exp-name slow --seeds 1",
+        "n_epochs --runs-dir elsewhere --seeds 1",
+        "transfer --seeds 2",
+        "gsde --seeds 2 --n-envs 4",
+    ],
+)
+def test_folders_are_those_of_the_script(arguments):
+    """Which the sweep cannot ask, as importing it takes seconds."""
+    for folder, command in runs(arguments):
+        words = shlex.split(command)
+        methods = "study.methods" in words
+        start = words.index("study.methods") + 2 if methods else words.index("--env-id")
+        method = words[start - 1] if methods else "ppo"
+        args = ppo.parse_args(words[start:], method=method)
+        assert str(folder) == str(ppo.run_path(args))
