@@ -491,8 +491,9 @@ def evaluate_due(run, agent, acting, eval_envs, global_step, args, bar):
     An evaluation at step t is of the policy that acts at step t. With 8,192 steps per update, the
     policy of step 8,192 acts until step 16,383, so it is the one evaluated for step 10,240.
     """
-    policy, end = numpy_policy(agent.actor_mean), global_step + args.n_steps * args.n_envs
-    due = range(run.next_eval, min(end, args.total_timesteps + 1), args.eval_freq)
+    next_update = global_step + args.n_steps * args.n_envs
+    due = range(run.next_eval, min(next_update, args.total_timesteps + 1), args.eval_freq)
+    policy = numpy_policy(agent.actor_mean) if due else None
     for step in due:
         if step == due[0] or not args.eval_once_per_policy:
             seeds = make_seeds(args.eval_episodes, args.seed, 2, step)
@@ -538,7 +539,8 @@ def git_commit():
     """Commit of this file, with "-dirty" where the checkout differs from it; None without git."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        return subprocess.check_output(command, cwd=Path(__file__).parent, text=True).strip()
+        how = {"cwd": Path(__file__).parent, "stderr": subprocess.DEVNULL, "text": True}
+        return subprocess.check_output(command, **how).strip()
     except (OSError, subprocess.CalledProcessError):
         return None
 

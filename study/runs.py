@@ -11,7 +11,6 @@ Sections named in study/ are those of Hollenstein, Martius, Piater: "Colored Noi
 import argparse
 import json
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from study.protocol import METHODS, NAMES, SETTINGS, bootstraps, ids_named
+from study.status import run_folders
 
 # The study varies these. Runs that are equal in all of them are the same run.
 AXES = ["environment", "beta", "n_envs", "n_steps", "n_epochs", "seed"]
@@ -65,12 +65,6 @@ def betas_text(text):
     if text in ("vanilla", "gsde"):
         return text
     return "_".join(beta_text(float(part)) for part in text.split("_"))
-
-
-def run_folders(root):
-    """The folders of runs at and under `root`, in order; symbolic links are followed."""
-    walk = os.walk(root, followlinks=True)
-    return sorted(Path(folder) for folder, _, files in walk if "config.json" in files)
 
 
 def read_run(folder):
