@@ -59,6 +59,19 @@ SETTINGS = {
     "normalize_rewards": False,
 }
 
+# Gymnasium's MuJoCo tasks with the settings that are usual there (results/plans.md): CleanRL's with
+# one environment, and many environments with short rollouts, as on GPUs
+GYMNASIUM = [
+    f"{name}-v5" for name in ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Swimmer", "Humanoid")
+]
+GYMNASIUM_FLAGS = ["--total-timesteps", "1000000", "--eval-freq", "50000", "--eval-episodes", "10"]
+GYMNASIUM_FLAGS += ["--learning-rate", "3e-4", "--anneal-lr", "--normalize-obs"]
+GYMNASIUM_FLAGS += ["--normalize-rewards"]
+GYMNASIUM_SIZES = {  # n_envs: flags
+    1: ["--n-steps", "2048", "--batch-size", "64"],
+    32: ["--n-steps", "128", "--batch-size", "512"],
+}
+
 # What run_sweep.sh varies: the values of each axis that a preset does not give otherwise
 GRID = {
     "seeds": SEEDS,
@@ -76,6 +89,12 @@ PRESETS = {
     "n_epochs": {"n_epochs": [5, 10, 20], "betas": [0.2, 0.5, 0.75]},
     "complex": {"envs": COMPLEX},
     "transfer": {"methods": ["trpo", "a2c"]},
+    "gymnasium": {
+        "envs": GYMNASIUM,
+        "betas": [0, 0.5, 1],
+        "n_envs": list(GYMNASIUM_SIZES),
+        "seeds": list(range(1, 9)),
+    },
     "gsde": {"n_envs": N_ENVS, "betas": ["gsde"], "methods": ["gsde"]},
 }
 

@@ -11,6 +11,8 @@ presets, each the paper's experiment as it was (dm_control without bootstrap at 
   complex   PointPush, AntPush, PointPushMaze and AntPushMaze, 8 betas, n_envs 4               640
   transfer  TRPO and A2C, 16 environments, 8 betas, n_envs 4                                  5120
   gsde      gSDE in place of colored noise, 16 environments, n_envs 1 to 128                  2560
+and one that is not the paper's
+  gymnasium six MuJoCo tasks, betas 0, 0.5, 1, n_envs 1 and 32, usual settings, 8 seeds        288
 what to run, lists in quotes in place of the preset's
   --envs "A B"        those below (or short: cheetah-run), or any id NAME-v0 or MODULE:NAME
   --betas "0 0.5"     noise colors, or auto, which goes by n_envs
@@ -52,7 +54,8 @@ import sys
 import textwrap
 from pathlib import Path
 
-from study.protocol import GRID, NAMES, PRESETS, SETTINGS, bootstraps, ids_named
+from study.protocol import GRID, GYMNASIUM_FLAGS, GYMNASIUM_SIZES, NAMES, PRESETS, SETTINGS
+from study.protocol import bootstraps, ids_named
 from study.status import status
 
 ROOT = str(Path(__file__).resolve().parent.parent)
@@ -129,6 +132,8 @@ def parse_args(argv):
         parser.error(f"{flag} is set by the sweep and cannot follow --")
     for axis, values in (GRID | PRESETS[args.preset]).items():
         setattr(args, axis, getattr(args, axis, None) or values)
+    if args.preset == "gymnasium" and set(args.n_envs) - {*GYMNASIUM_SIZES}:
+        parser.error("gymnasium has --n-envs 1 and 32")
     args.mode = "task" if args.only else args.mode or "local"
     return args
 
@@ -165,6 +170,9 @@ def run(args, seed, env_id, n_envs, beta, n_epochs, method):
     if n_epochs != SETTINGS["n_epochs"]:
         flags += ["--n-epochs", str(n_epochs)]
         name += f"_n_epochs_{n_epochs}"
+    if args.preset == "gymnasium":
+        flags += GYMNASIUM_FLAGS + GYMNASIUM_SIZES[n_envs]
+        name = args.exp_name or "gymnasium"
     flags += ["--n-envs", str(n_envs), "--seed", str(seed), "--exp-name", name]
     if not bootstraps(env_id):
         flags += ["--no-bootstrap-timeouts"]
