@@ -54,8 +54,16 @@ import sys
 import textwrap
 from pathlib import Path
 
-from study.protocol import GRID, GYMNASIUM_FLAGS, GYMNASIUM_SIZES, NAMES, PRESETS, SETTINGS
-from study.protocol import bootstraps, ids_named
+from study.protocol import (
+    GRID,
+    GYMNASIUM_FLAGS,
+    GYMNASIUM_SIZES,
+    NAMES,
+    PRESETS,
+    SETTINGS,
+    bootstraps,
+    ids_named,
+)
 from study.status import status
 
 ROOT = str(Path(__file__).resolve().parent.parent)
