@@ -30,7 +30,7 @@ def test_presets(preset):
     assert len(found) == len(dict(found)) == len({command for _, command in found}) == size
     assert all(" --resume" in command for _, command in found)
     ids = {flags(command, "--env-id") for _, command in found}
-    assert len(ids) == {"quick": 1, "complex": 4}.get(preset, 16)
+    assert len(ids) == {"quick": 1, "complex": 4, "gymnasium": 6}.get(preset, 16)
 
 
 def test_narrowing_and_quoting(monkeypatch):
