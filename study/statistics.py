@@ -9,20 +9,27 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+CELL = ["method", "beta", "n_envs", "n_steps", "n_epochs"]  # within an environment
+FEW = 5  # runs: the interval of fewer is made with a standard deviation pooled over cells
+
 
 def standardize(runs):
     """Performance of the runs, standardized over all of them in the same environment: a Series.
 
     Sec. "Evaluation Details": "results are grouped by environment and standardized to zero mean and
     unit variance to control for the impact of the environments. We combine these standardized
-    results by averaging across different environments and seeds." In an environment without
+    results by averaging across different environments and seeds." Each cell (method, beta, n_envs,
+    n_steps, n_epochs) weighs the same, however many seeds it has. In an environment without
     variance all are 0.
     """
-
-    def z(x):
-        return (x - x.mean()) / x.std(ddof=0) if np.ptp(x) > 0 else 0 * x
-
-    return runs.groupby("environment").performance.transform(z)
+    keys = ["environment", *runs.columns.intersection(CELL)]
+    weight = 1 / runs.groupby(keys, dropna=False).performance.transform("size")
+    weight /= weight.groupby(runs.environment).transform("sum")
+    mean = (weight * runs.performance).groupby(runs.environment).transform("sum")
+    centered = runs.performance - mean
+    std = (weight * centered**2).groupby(runs.environment).transform("sum") ** 0.5
+    varies = runs.groupby("environment").performance.transform(np.ptp) > 0
+    return (centered / std).where(varies, 0.0)
 
 
 def mean_interval(values, n_resamples=9999):
@@ -45,10 +52,22 @@ def mean_interval(values, n_resamples=9999):
 
 
 def mean_intervals(runs, column, by):
-    """`mean_interval` of a column in each group of runs: a DataFrame of mean, low, high, runs."""
+    """Means of a column and their 95 % intervals in each group of runs.
+
+    That of `mean_interval`; of fewer than five runs, Student's, with the standard deviation pooled
+    over all groups of the same environment: two or three runs say too little of their own scatter.
+    by: columns, `environment` among them. Returns a DataFrame of mean, low, high, runs.
+    """
     groups = runs.groupby(by)[column]
     rows = [[*mean_interval(values), len(values)] for _, values in groups]
-    return pd.DataFrame(rows, groups.mean().index, columns=["mean", "low", "high", "runs"])
+    table = pd.DataFrame(rows, groups.mean().index, columns=["mean", "low", "high", "runs"])
+    scatter = pd.DataFrame({"df": groups.size() - 1, "squares": groups.var().fillna(0)})
+    scatter["squares"] *= scatter.df
+    pooled = scatter.groupby("environment").transform("sum").replace({"df": {0: np.nan}})
+    half = stats.t.ppf(0.975, pooled.df) * (pooled.squares / pooled.df / table.runs) ** 0.5
+    few = table.runs < FEW
+    table.loc[few, "low"], table.loc[few, "high"] = table["mean"] - half, table["mean"] + half
+    return table
 
 
 def cells_interval(samples):
@@ -186,44 +205,54 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
 
     In each cell with all groups: the sum of weight times mean over seeds; only where each has two
     seeds, if such cells are there; with a second column of cells, those of `same_cells`. Then over
-    environments: their E are taken for a sample of `of`, the seeds for a sample of each (Cochran,
-    Sampling Techniques, Sec. 10.3): with f = E / of the variance is (1 - f) s^2 / E between
-    environments + f / E times the mean variance by seeds. So 16 of 16 are the study itself, where
-    only seeds are chance.
+    environments, each weighing the same. Seeds scatter in
+    an environment with a standard deviation that is pooled over its cells and groups here.
+    The E environments are taken for a sample of `of` (Cochran, Sampling Techniques, Sec. 10.3):
+    with f = E / of the variance is (1 - f) s^2 / E between environments + f / E times the mean
+    variance by seeds. So 16 of 16 are the study itself, where only seeds are chance.
 
     weights: {value of the column `by`: weight}. cells: columns, `environment` first, and at most
     one more.
 
-    Returns a dict: environments, and where there are any: mean; se, NaN where a group has one seed;
-    df; made_of, in words; enough: whether it is of half of the environments, and of three values of
-    the second column of cells, if any.
+    Returns a dict: environments, and where there are any: mean; se, NaN where all groups have one
+    seed; df; by_seeds, the error that is left with all `of` environments; runs; made_of, in words;
+    lacks, in words, "" where there is enough: half of the environments, and three values of the
+    second column of cells, if any.
     """
     weight = pd.Series(weights, dtype=float)
     groups = runs[runs[by].isin(list(weights))].groupby([*cells, by]).z
     if groups.ngroups == 0:
         return {"environments": 0}
-    tables = groups.mean(), groups.var(), groups.size()
+    tables = groups.mean(), groups.var().fillna(0), groups.size()
     tables = [table.unstack(by).reindex(columns=weight.index) for table in tables]
-    there, two = tables[0].notna().all(axis=1), tables[1].notna().all(axis=1)
-    chosen = tables[0].index[two if two.any() else there]
-    enough, made_of = True, ""
+    there, two = tables[2].notna().all(axis=1), (tables[2] > 1).all(axis=1)
+    chosen, lacks, made_of = tables[2].index[two if two.any() else there], "", ""
     if len(cells) > 1:
         chosen, shared = same_cells(chosen, of)
-        enough = len(shared) >= 3
+        lacks = f"more of {cells[1]}" * (len(shared) < 3)
         made_of = f", {cells[1]} {', '.join(f'{value:g}' for value in sorted(shared))}"
     mean, variance, seeds = (table.loc[chosen] for table in tables)
     if mean.empty:
         return {"environments": 0}
-    environments = mean.index.get_level_values("environment")
-    by_environment = (mean * weight).sum(axis=1).groupby(environments).mean()
+    seeds_of = seeds.groupby("environment")
+    df = (seeds - 1).groupby("environment").sum().sum(axis=1)
+    squares = (variance * (seeds - 1)).groupby("environment").sum().sum(axis=1)
+    pooled = squares / df.where(df > 0)  # NaN: one seed each
+    each = (weight**2 / seeds).sum(axis=1).groupby("environment").sum() / seeds_of.size() ** 2
+    by_environment = (mean * weight).sum(axis=1).groupby("environment").mean()
+    known = pooled.notna() if pooled.notna().any() else pooled.isna()
+    by_environment, within, df = by_environment[known], (pooled * each)[known], df[known]
     n = len(by_environment)
     f = min(n / of, 1)
-    within = f * (variance * weight**2 / seeds).to_numpy() / len(mean) ** 2
     between = (1 - f) * by_environment.var() / n if f < 1 else 0.0
-    each_df = np.append((seeds - 1).clip(lower=1), max(n - 1, 1))
-    found = {"mean": by_environment.mean()} | summed(np.append(within, between), each_df)
-    found |= {"environments": n, "enough": bool(enough and n >= of / 2)}
-    return found | {"made_of": f"{n} environment{'s'[: n > 1]}{made_of}"}
+    found = {"mean": by_environment.mean(), "environments": n, "of": of}
+    found |= summed(
+        np.append(f * within / n**2, between), np.append(df.clip(lower=1), max(n - 1, 1))
+    )
+    found |= {"by_seeds": (within.mean() / max(of, n)) ** 0.5, "runs": int(seeds.to_numpy().sum())}
+    if n < of / 2:
+        lacks = f"{-(-of // 2) - n} environments more" + f" and {lacks}" * bool(lacks)
+    return found | {"lacks": lacks, "made_of": f"{n} environment{'s'[: n > 1]}{made_of}"}
 
 
 def interval(found, alpha=0.05):

@@ -65,9 +65,8 @@ def test_claims_on_noise_flip_with_the_data(made_up, coverage):
     turned = coverage(says, ppo=made_up(lambda *of: -level(*of)))
     flat = coverage(says, ppo=made_up(lambda *of: 0))
     assert set(table.verdict) == {"holds"} and set(turned.verdict) == {"does not"}
-    assert set(flat.verdict) <= {"open", "does not"} and flat.verdict[says[0]] == "open"
+    assert set(flat.verdict) <= {"open", "does not"}
     assert table.runs[says[0]] == "720 of 20480"
-    assert "at n_envs 1: 0, 4: 0.5, 32: 1" in table.data[says[0]]
 
 
 def test_the_best_beta_and_the_rule(made_up, coverage, verdicts):
@@ -107,25 +106,14 @@ def test_the_best_n_envs(made_up, verdicts):
     assert verdicts(says, ppo=runs) == ["open", "holds"]
 
 
-def test_comparable_in_more_environments_than_white_and_pink(made_up):
-    def claim(sign, **few):
-        runs = made_up(lambda e, b, n: sign * abs(b - 0.5), **few)
-        return claims.comparable_counts(runs)
-
-    verdict, text = claim(-1)
-    assert verdict == "holds" and "0.5: 16/16, 0: 0/16, 1: 0/16 environments (paper" in text
-    assert claim(1)[0] == "does not" and claim(0)[0] == "open"
-    for few in ({"envs": MAIN[1:]}, {"n_envs": (4, 32)}, {"betas": (0, 0.5)}):
-        assert claim(-1, **few)[0] == "open", few
-
-
 def test_the_best_beta_depends_on_the_environment(made_up):
     def claim(of, says=claims.best_beta_varies):
         runs = made_up(lambda e, beta, n: beta * of.get(e, 0), n_envs=[4])
-        return says(runs.assign(z=standardize(runs)))
+        found = says(runs.assign(z=standardize(runs)))
+        return found.verdict, found.data
 
-    text = "beta 1 ahead of 0 in 1, behind in 1 of 16 environments"
-    assert claim({CAR: 3, PENDULUM: -3}) == ("holds", text)
+    verdict, text = claim({CAR: 3, PENDULUM: -3})
+    assert verdict == "holds" and "0 in 1 (Mountain Car), behind in 1 (Pendulum" in text
     assert claim({CAR: 3})[0] == "open" and claim({})[0] == "open"
     # And 0.5 is ahead in most environments: in nine, not in eight; behind in eight
     for count, sign, verdict in ((9, 1, "holds"), (8, 1, "open"), (8, -1, "does not")):
@@ -155,9 +143,51 @@ def test_a_best_beta_that_is_the_same_everywhere_is_no_trend(made_up):
     """With any n_envs: neither larger with more of them, nor as the bias projects."""
     runs = made_up(lambda e, beta, n: -3 * abs(beta - 0.5))
     runs = runs.assign(z=standardize(runs))
-    verdict, text = claims.larger_n_envs_larger_beta(runs)
-    assert verdict == "open" and "0.00 [0.00, 0.00]" in text
-    assert claims.ranks_as_projected(runs)[0] == "open"
+    for test in (claims.larger_n_envs_larger_beta, claims.ranks_as_projected):
+        found = test(runs)
+        assert found.verdict == "open" and found.low < 0 < found.high
+
+
+def test_trends_are_decided_by_environments_that_were_not_seen_before(made_up):
+    """They rise in those that had been seen, and fall in the others."""
+
+    def level(env_id, beta, n):
+        return beta * np.log2(n) * (1 if NAMES[env_id] in claims.SEEN else -1)
+
+    runs = made_up(level)
+    runs = runs.assign(z=standardize(runs))
+    assert claims.larger_n_envs_larger_beta(runs).verdict == "does not"
+    few = runs[runs.environment.isin(claims.SEEN)]
+    found = claims.larger_n_envs_larger_beta(few)
+    assert found.verdict == "open" and found.decides == "the other 7 environments"
+
+
+def test_runs_of_a_few_environments_change_no_verdict_on_all(made_up, coverage):
+    """Another beta in three environments, and another n_envs: the same numbers."""
+    says = ["beta 0.5 outperforms white noise", "the color of the noise affects performance"]
+    says += ["colored noise does better than white in most environments"]
+    runs = made_up(lambda e, beta, n: 0.1 * beta)
+    more = [made_up(lambda *of: 9, MAIN[:3], betas=[2], seeds=2)]
+    more += [made_up(lambda *of: -9, MAIN[:3], n_envs=[8], seeds=2)]
+    before, after = coverage(says, ppo=runs), coverage(says, ppo=pd.concat([runs, *more]))
+    columns = ["verdict", "data", "mean", "low", "high", "decides"]
+    pd.testing.assert_frame_equal(before[columns], after[columns])
+
+
+def test_what_would_decide(made_up):
+    """With as many runs as it says, of the same scatter, the interval just excludes nothing."""
+    runs = made_up(lambda e, beta, n: 0.05 * (beta == 0.5), betas=(0, 0.5), n_envs=[4])
+    runs = runs.assign(z=standardize(runs))
+    weights = {0.5: 1, 0.0: -1}
+    found = claims.between(runs, "", weights, "beta")
+    assert found.verdict == "open" and found.low < 0 < found.mean
+    more = int(re.search(r"([\d,]+) runs more, if", found.decides)[1].replace(",", ""))
+    times = round((len(runs) + more) / len(runs))
+    many = pd.concat([runs] * times)
+    low = claims.between(many, "", weights, "beta").low
+    assert 0 < low < found.mean / 3 or -found.mean / 3 < low < 0
+    few = claims.between(runs[runs.env_id.isin(MAIN[:5])], "", weights, "beta")
+    assert few.decides == "3 environments more"
 
 
 def test_claims_that_two_are_the_same(made_up, verdicts):
@@ -252,7 +282,7 @@ def test_white_noise_hardly_finds_the_goal():
         (40, 12, "does not"),
     ):
         runs = pd.DataFrame({"final_return": [94.0] * found + [-1e-5] * (n - found)})
-        assert claims.hardly_found(runs)[0] == verdict
+        assert claims.hardly_found(runs).verdict == verdict
 
 
 def test_policies_that_collapse_are_counted(made_up):
@@ -262,12 +292,11 @@ def test_policies_that_collapse_are_counted(made_up):
         curves = pd.DataFrame({10: 0.0, 20: 5.0, 30: 5.0}, runs.index)
         curves.loc[runs.seed < 5 * share, 30] = 1.0
         parts = claims.claim_runs({"ppo": runs}, curves)
-        found, text = claims.no_collapse(parts["n_envs 4"][0])
-        assert found == verdict and "(beta -1, 0, 0.2, 0.5, 0.75, 1" in text
+        assert claims.no_collapse(parts["n_envs 4"][0]).verdict == verdict
 
 
 def test_cells_outside_are_compared_with_chance():
-    """Intervals of few seeds are too narrow: MISSES, here checked for five by simulation."""
+    """MISSES, here checked for five seeds by simulation; of three, in a pooled interval, exact."""
     rng = np.random.default_rng(3)
     samples, means = rng.normal(size=(200, 5)), rng.normal(size=200) / 20**0.5
     ends = [mean_interval(sample, 999)[1:] for sample in samples]
@@ -275,7 +304,7 @@ def test_cells_outside_are_compared_with_chance():
     assert np.mean(missed) == pytest.approx(claims.MISSES[5], abs=0.07)
     table = pd.DataFrame({"in_interval": ["yes", "no", "yes", np.nan], "runs": [5, 5, 3, 1]})
     count, chance, line = claims.outside(table)
-    assert count == 1 and chance == pytest.approx(2 * 0.191 + 0.302)
+    assert count == 1 and chance == pytest.approx(2 * 0.191 + 0.0675, abs=1e-3)
     assert line.startswith("1 of 3 published means outside")
 
 
@@ -313,5 +342,5 @@ def test_published_means_far_off_are_more_than_chance(made_up):
         runs = made_up(lambda e, beta, n: off + mean[NAMES[e], f"{beta:g}"], **few)
         return claims.published_final_returns(runs)
 
-    assert claim(0)[0] == "open" and claim(3)[0] == "does not"
-    assert claim(3)[1].startswith("12 of 12 published means outside")
+    assert claim(0).verdict == "open" and claim(3).verdict == "does not"
+    assert claim(3).data.startswith("12 of 12 published means outside")

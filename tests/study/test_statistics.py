@@ -16,6 +16,11 @@ def test_standardized_within_each_environment():
     z = statistics.standardize(runs)
     assert z[runs.environment == "A"].tolist() == [-1, -1, 1, 1]
     assert (z[runs.environment == "B"] == 0).all()
+    # Cells weigh the same: more runs of the one beta move nothing
+    runs = pd.DataFrame({"environment": "A", "beta": [0, 0, 1, 1], "performance": [0, 2, 4, 6]})
+    more = pd.concat([runs, runs[:2], runs[:2]], ignore_index=True)
+    assert statistics.standardize(runs).std(ddof=0) == pytest.approx(1)
+    np.testing.assert_allclose(statistics.standardize(more)[:4], statistics.standardize(runs))
 
 
 def test_intervals_are_scipys_bca():
@@ -39,6 +44,22 @@ def test_intervals_of_degenerate_data():
     assert low[0] < mean[0] < high[0] and low[1] == mean[1] == high[1]
     assert np.isnan(statistics.cells_interval([[1.0, 2.0], [1.0]])[1:]).all()
     assert statistics.cells_interval([[1, 1], [2, 2]]) == (1.5, 1.5, 1.5)
+
+
+def test_intervals_of_few_runs_pool_the_scatter_of_their_environment():
+    """Student's interval with the variance that scipy's ANOVA of the environment's groups has."""
+    rng = np.random.default_rng(0)
+    runs = pd.DataFrame({"environment": [*"AAAAAAAAAAAA", *"BB"], "beta": [*"00111222222222"]})
+    runs["x"] = rng.normal(size=len(runs))
+    table = statistics.mean_intervals(runs, "x", ["environment", "beta"])
+    groups = [x for _, x in runs[runs.environment == "A"].groupby("beta").x]
+    squares = sum(((x - x.mean()) ** 2).sum() for x in groups)
+    half = stats.t.ppf(0.975, 9) * (squares / 9 / 3) ** 0.5
+    three, seven = table.loc["A", "1"], table.loc["A", "2"]
+    assert [three.low, three.high] == pytest.approx([three["mean"] - half, three["mean"] + half])
+    assert seven.tolist() == [*statistics.mean_interval(groups[2]), 7]
+    alone = statistics.mean_intervals(runs[:1], "x", ["environment", "beta"])
+    assert alone.low.isna().all() and table.loc["B", "2"].low < table.loc["B", "2"]["mean"]
 
 
 def test_cells_weigh_the_same_whatever_their_seeds():
@@ -87,54 +108,24 @@ def test_welch():
     assert light == pytest.approx(without, rel=1e-4)
 
 
-def test_interquartile_mean():
-    z = np.random.default_rng(0).normal(size=16)
-    assert statistics.iqm(z[:8], z[8:]) == pytest.approx(stats.trim_mean(z, 0.25))
-    # Cells weigh the same: sixteen runs at 0 and two at 1 are as much as two and two
-    assert statistics.iqm(np.zeros(16), np.ones(2)) == pytest.approx(0.5)
-
-
-def test_probability_of_improvement():
-    rng = np.random.default_rng(0)
-    ours, theirs = rng.integers(0, 5, (2, 8)), rng.integers(0, 4, (2, 7))  # with ties
-    u = [stats.mannwhitneyu(x, y).statistic / 56 for x, y in zip(ours, theirs, strict=True)]
-    assert statistics.improvement(*ours, *theirs) == pytest.approx(np.mean(u))
-
-
-def test_stratified_bootstrap():
-    """Cells that differ widely, but not within themselves, leave no uncertainty."""
-    samples = [np.full(5, 0.0), np.full(5, 9.0)]
-    assert statistics.stratified(samples, statistics.iqm) == (4.5, 4.5, 4.5)
-    mean, low, high = statistics.stratified([np.array([1.0, 2, 3, 4, 5])], statistics.iqm)
-    assert low < mean == 3 < high
-    few = statistics.stratified([np.array([1.0, 2, 3, 4])], statistics.iqm)
-    assert few[0] == 2.5 and np.isnan(few[1:]).all()
-
-
-def test_the_interval_of_five_seeds_in_nine_cells_holds_what_it_should():
-    """The true probability of improvement of a shift by half a standard deviation."""
-    rng, held, true = np.random.default_rng(0), 0, stats.norm.cdf(0.5 / 2**0.5)
-    for _ in range(60):
-        z = rng.normal(size=(18, 5))
-        z[:9] += 0.5
-        _, low, high = statistics.stratified(list(z), statistics.improvement)
-        held += low < true < high
-    assert 0.85 <= held / 60 < 1
-
-
-def test_contrast_is_welchs_interval_where_the_environment_is_all_there_is():
+def test_contrast_is_students_interval_where_the_environment_is_all_there_is():
     rng, weights = np.random.default_rng(1), {1.0: 1, 0.0: -1}
     runs = pd.DataFrame({"environment": "A", "beta": [0.0] * 5 + [1.0] * 4})
     runs["z"] = rng.normal(size=9)
     found = statistics.contrast(runs, weights, "beta", of=1)
-    test = stats.ttest_ind(runs.z[5:], runs.z[:5], equal_var=False).confidence_interval()
+    test = stats.ttest_ind(runs.z[5:], runs.z[:5]).confidence_interval()
     assert statistics.interval(found) == pytest.approx((test.low, test.high))
-    # One seed has no interval, equal values have a point; a group that is not there, nothing
-    single = statistics.contrast(runs[4:], weights, "beta")
-    assert np.isnan(statistics.interval(single)[0])
+    assert found["by_seeds"] == pytest.approx(found["se"]) and found["runs"] == 9
+    # A single seed takes its scatter from the others; equal values leave a point
+    single = statistics.contrast(runs[4:], weights, "beta", of=1)
+    test = stats.ttest_ind(runs.z[5:], runs.z[4:5]).confidence_interval()
+    assert statistics.interval(single) == pytest.approx((test.low, test.high))
+    alone = statistics.contrast(runs[4:6], weights, "beta", of=1)
+    assert np.isnan(statistics.interval(alone)[0])
     same = statistics.contrast(runs.assign(z=runs.beta), weights, "beta", of=1)
     assert statistics.interval(same) == (1, 1)
     assert statistics.contrast(runs, {1.0: 1, 2.0: -1}, "beta") == {"environments": 0}
+    assert statistics.contrast(runs, weights, "beta")["lacks"] == "7 environments more"
 
 
 def test_contrasts_of_few_seeds_hold_the_mean_as_often_as_they_say():
