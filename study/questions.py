@@ -1,0 +1,215 @@
+"""Answers to the questions of results/plans.md, as their analyses were written there beforehand.
+
+    python -m study.questions
+
+prints them as Markdown tables, from the packed runs in results/. A question whose runs are not
+there yet is passed over.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from study.protocol import GYMNASIUM
+from study.runs import load, published
+from study.statistics import mean_interval
+
+RESULTS = Path(__file__).parent.parent / "results"
+STEPS = [204_800 * i for i in range(1, 11)]  # of the ten evaluations that all of these runs have
+PENDULUM, CAR = "dm_control/pendulum-swingup-v0", "MountainCarContinuous-v0"
+
+
+def complete(env_id, *names):
+    """The complete runs of an environment in these files of results/, each seed once.
+
+    `performance` is the mean over the evaluations at STEPS.
+    """
+    files = [RESULTS / f"{name}.csv" for name in names if (RESULTS / f"{name}.csv").exists()]
+    if not files:
+        return pd.DataFrame()
+    runs, curves = load(files)
+    runs = runs[(runs.status == "complete") & (runs.env_id == env_id)]
+    runs = runs[runs.total_timesteps == STEPS[-1]]
+    return runs.assign(performance=curves.loc[runs.index, STEPS].mean(axis=1, skipna=False))
+
+
+def as_in_the_paper(runs):
+    """Those with its batch size, length of sequences and treatment of time limits."""
+    usual = (runs.batch_size == 128) & (runs.noise_seq_len == 1000)
+    usual &= (runs.env_id == CAR) | ~runs.bootstrap_timeouts.astype(bool)
+    return runs[usual].drop_duplicates(["method", "beta", "n_envs", "seed"])
+
+
+def mean_text(values):
+    mean, low, high = mean_interval(values)
+    return f"{mean:.0f} [{low:.0f}, {high:.0f}]"
+
+
+def difference_text(a, b):
+    """Mean of a less that of b with Welch's interval, and p of Mann and Whitney's test."""
+    low, high = stats.ttest_ind(a, b, equal_var=False).confidence_interval()
+    p = stats.mannwhitneyu(a, b).pvalue
+    return f"{np.mean(a) - np.mean(b):.0f} [{low:.0f}, {high:.0f}], p = {p:.2f}"
+
+
+def stable_baselines3():
+    """Pendulum Swingup, white noise, n_envs 1: Stable-Baselines3 (SB3) beside this script."""
+    theirs = complete(PENDULUM, "sb3")
+    if len(theirs) < 2:
+        return None
+    ours = as_in_the_paper(complete(PENDULUM, "new_seeds")).query("n_envs == 1 and beta == '0'")
+    rows = []
+    for column, paper in (("final_return", "714.5"), ("performance", "")):
+        row = {
+            "": column.replace("_", " "),
+            f"this script, {len(ours)} runs": mean_text(ours[column]),
+        }
+        row[f"SB3, {len(theirs)} runs"] = mean_text(theirs[column])
+        row["SB3 less this script"] = difference_text(theirs[column], ours[column])
+        rows.append(row | {"published": paper})
+    return pd.DataFrame(rows)
+
+
+def pendulum_order():
+    """Pendulum Swingup, n_envs 1: performance by beta. In the paper 0 is best."""
+    runs = as_in_the_paper(complete(PENDULUM, "new_seeds", "study"))
+    runs = runs.query("n_envs == 1 and seed > 100")
+    groups = [runs[runs.beta == beta].performance for beta in ("0", "0.5", "1")]
+    if min(map(len, groups)) < 2:
+        return None
+    rows = []
+    for beta, values in zip((0, 0.5, 1), groups, strict=True):
+        row = {"beta": f"{beta:g}", "runs": f"{len(values)}", "performance": mean_text(values)}
+        row["beta 0 less this"] = difference_text(groups[0], values) if beta else ""
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def pendulum_beside_published():
+    """Pendulum Swingup, n_envs 4: final returns of all runs, and how far off on average."""
+    runs = complete(PENDULUM, "reproduction", "study", "noise_length", "new_seeds")
+    runs = as_in_the_paper(runs).query("n_envs == 4")
+    paper = published("final_return_per_beta").set_index(["environment", "n_envs", "beta"])
+    paper = paper.final_return_mean["Pendulum Swingup", 4]
+    cells = runs.groupby("beta").final_return.agg(["mean", "var", "size"])
+    cells["less"] = cells["mean"] - paper[cells.index]
+    rows = []
+    for beta, values in runs.groupby("beta").final_return:
+        row = {"beta": beta, "runs": f"{len(values)}", "final return": mean_text(values)}
+        less = f"{cells.less[beta]:.0f}"
+        rows.append(row | {"published": f"{paper[beta]}", "ours less the published": less})
+    df, n = cells["size"] - 1, len(cells)
+    pooled = (cells["var"] * df).sum() / df.sum()
+    se = (pooled * (1 / cells["size"] + 1 / 20)).sum() ** 0.5 / n
+    mean, half = cells.less.mean(), stats.t.ppf(0.975, df.sum()) * se
+    p = 2 * stats.t.sf(abs(mean) / se, df.sum())
+    average = f"{mean:.0f} [{mean - half:.0f}, {mean + half:.0f}], p = {p:.3f}"
+    rows.append({"beta": "average", "ours less the published": average})
+    return pd.DataFrame(rows).fillna("")
+
+
+def mountain_car():
+    """Mountain Car, n_envs 4: runs that end at the goal; Fisher's test against the published."""
+    runs = as_in_the_paper(complete(CAR, "study")).query("n_envs == 4 and seed > 400")
+    released = complete(CAR, "released_code")
+    cells = {
+        "beta 0.2, batch size 128, T = 1000": (runs[runs.beta == "0.2"], 5)
+        if len(runs)
+        else ([], 5),
+        "beta 0.2, batch size 64, T = 1024": (released, 5),
+        "beta 0, batch size 128, T = 1000": (runs[runs.beta == "0"], 0),
+    }
+    rows, counts = [], []
+    for name, (cell, paper) in cells.items():
+        if len(cell):
+            count, n = int((cell.final_return > 0).sum()), len(cell)
+            counts.append([count, n - count])
+            low, high = stats.binomtest(count, n).proportion_ci()
+            row = {"": name, "end at the goal": f"{count} of {n}"}
+            row["share, 95 % interval"] = f"{low:.2f} to {high:.2f}"
+            p = stats.fisher_exact([counts[-1], [paper, 20 - paper]]).pvalue
+            rows.append(row | {"published": f"{paper} of 20", "p": f"{p:.2f}"})
+    if len(released) and len(counts) > 1:
+        p = stats.fisher_exact(counts[:2]).pvalue
+        rows.append({"": "the first two against each other", "p": f"{p:.2f}"})
+    return pd.DataFrame(rows).fillna("") if rows else None
+
+
+def gymnasium_scores(measure="last five"):
+    """Scores of the runs of `run_sweep.sh gymnasium`: {(task, n_envs, beta): (seeds,)}.
+
+    measure: "last five" evaluations' mean, or "all" twenty's, the area under the curve. Only tasks
+    with all betas and n_envs, two seeds each.
+    """
+    file = RESULTS / "gymnasium.csv"
+    if not file.exists():
+        return {}
+    runs, curves = load([file])
+    runs, curves = (table[runs.status == "complete"] for table in (runs, curves))
+    curves = curves.dropna(axis=1)
+    runs["score"] = (curves.iloc[:, -5:] if measure == "last five" else curves).mean(axis=1)
+    cells = runs.groupby(["env_id", "n_envs", "beta"]).score.apply(np.array)
+    cells = cells[cells.map(len) > 1]
+    tasks = [task for task in GYMNASIUM if len(cells.get(task, [])) == 6]
+    return {key: cells[key] for key in cells.index if key[0] in tasks}
+
+
+def gymnasium_leads(scores, beta, n_envs, draws=None):
+    """Lead of a beta over white noise in each task, in its standard deviations: (tasks, draws).
+
+    That is pooled over the betas of the task with this n_envs. draws: how often seeds are drawn
+    anew, or None for those that there are.
+    """
+    leads, rng = [], np.random.default_rng([0, n_envs, int(2 * float(beta))])
+    for task in dict.fromkeys(task for task, _, _ in scores):
+        cells = [x for (name, n, _), x in scores.items() if (name, n) == (task, n_envs)]
+        squares = sum(((x - x.mean()) ** 2).sum() for x in cells)
+        std = (squares / sum(len(x) - 1 for x in cells)) ** 0.5
+        pair = [scores[task, n_envs, which] for which in (beta, "0")]
+        if draws:
+            pair = [x[rng.integers(len(x), size=(draws, len(x)))].T for x in pair]
+        leads.append((pair[0].mean(0) - pair[1].mean(0)) / std)
+    return np.array(leads)
+
+
+def gymnasium(measure="last five", draws=10_000):
+    """Gymnasium's tasks: leads over white noise in standard deviations. A n_envs 1, B n_envs 32."""
+    scores = gymnasium_scores(measure)
+    if not scores:
+        return None
+    columns = {
+        f"{name}: {beta} over 0": [gymnasium_leads(scores, beta, n, d) for d in (None, draws)]
+        for name, n in (("A", 1), ("B", 32))
+        for beta in ("0.5", "1")
+    }
+    a, b = columns["A: 1 over 0"], columns["B: 1 over 0"]
+    columns["B less A: 1 over 0"] = [y - x for x, y in zip(a, b, strict=True)]
+    tasks = list(dict.fromkeys(task for task, _, _ in scores))
+    which = np.random.default_rng(1).integers(len(tasks), size=(len(tasks), draws))
+    table = pd.DataFrame({"task": [*tasks, "average", "95 %, by tasks and seeds",
+                                   "98.75 %, by tasks and seeds", "95 %, by seeds"]})  # fmt: skip
+    for name, (leads, drawn) in columns.items():
+        by_tasks = np.take_along_axis(drawn, which, axis=0).mean(0)
+        intervals = [(by_tasks, 2.5), (by_tasks, 0.625), (drawn.mean(0), 2.5)]
+        ends = [np.percentile(x, [tail, 100 - tail]) for x, tail in intervals]
+        numbers = [f"{x:z.2f}" for x in (*leads, leads.mean())]
+        table[name] = numbers + [f"{low:z.2f} to {high:z.2f}" for low, high in ends]
+    return table
+
+
+QUESTIONS = [stable_baselines3, pendulum_order, pendulum_beside_published, mountain_car, gymnasium]
+
+
+def main():
+    for question in QUESTIONS:
+        table = question()
+        if table is not None:
+            rows = [table.columns, ["---"] * len(table.columns), *table.to_numpy()]
+            lines = [f"| {' | '.join(row)} |" for row in rows]
+            print("\n".join([question.__doc__, "", *lines, ""]))
+
+
+if __name__ == "__main__":
+    main()
