@@ -222,7 +222,7 @@ def test_why_it_works():
     """With one of the twenty seeds."""
     code, spectrum = blocks(section(LESSON, "3. Why it works"), "python")
     lines = printed(code.replace("range(1, 21)", "range(1, 2)")).splitlines()
-    assert [int(re.search(r"reached in (\d+)", line)[1]) for line in lines] == [0, 1, 1, 1]
+    assert [int(re.search(r"goal in (\d+)", line)[1]) for line in lines] == [0, 1, 1, 1]
     power = [float(line.split()[1]) for line in printed(spectrum).splitlines()]
     assert power == [1.0, 3.1, 5.3, 1.6]
 
