@@ -1,4 +1,4 @@
-"""Runs as tables: reads them, chooses those that may be averaged, puts the paper's beside them.
+"""Runs as tables: reads them, chooses those that may be averaged, adds the published numbers.
 
 python -m study.runs pack runs/ results/sweep.csv
 
@@ -131,7 +131,7 @@ def read_packed(path):
     except (ValueError, LookupError, AttributeError, TypeError) as error:
         raise Unusable(f"{path} is not a file that `study.runs pack` wrote: {error}") from error
     if wrong.any():
-        raise Unusable(f"{path} is damaged: its run {wrong.argmax() + 1} is not whole")
+        raise Unusable(f"{path} is damaged: run {wrong.argmax() + 1} in it lacks evaluations")
     return runs, curves
 
 
@@ -189,7 +189,7 @@ def asked_for(runs, env, beta, n_envs):
             raise Unusable(f"no runs with {column} {value}; there are: {texts}")
         if wanted:
             keep &= runs[column].isin(wanted) | (column == "beta") & (runs.method == "gsde")
-    need(keep.any(), "runs that have all of --env, --beta and --n-envs: there are none")
+    need(keep.any(), "runs that match --env, --beta and --n-envs: there are none")
     return keep | runs.env_id.isna()
 
 
@@ -257,7 +257,7 @@ def select(runs, method="ppo"):
     left_out = (places(runs) + status)[status != "complete"].tolist()
     chosen = runs[status == "complete"]
     if chosen.empty:
-        what = f"no complete run of the kind that is asked for with the method {method}"
+        what = f"no complete run of the method {method} matches --env, --beta, --n-envs"
         raise Unusable("; ".join([what, *left_out[:1]]))
     compared = complete.columns.difference([*AXES, *EVALUATION, *UNIMPORTANT])
     twice = complete[complete.duplicated(AXES, keep=False)]
@@ -290,7 +290,7 @@ def select_methods(runs, method="ppo"):
             lines = (places(part) + part.status).tolist()
         left_out += lines
     if not any(map(len, chosen.values())):
-        raise Unusable("; ".join(["no complete run of the kind that is asked for", *left_out[:1]]))
+        raise Unusable("; ".join(["no complete run matches --env, --beta, --n-envs", *left_out[:1]]))
     return chosen, left_out
 
 
