@@ -1,17 +1,18 @@
-"""PPO of Stable-Baselines3, the paper's own stack on today's versions, to compare results with.
+"""PPO of Stable-Baselines3: the paper's own stack, in today's versions, to compare results with.
 
     pip install -r requirements.txt -r tests/requirements.txt
     python -m study.sb3 --env-id dm_control/pendulum-swingup-v0 --vanilla --no-bootstrap-timeouts
 
-Task and settings are given by the flags of ppo_colored_continuous.py, and the run's folder has the
-same files. Nothing else of the script takes part: environments, networks, rollout, update and
-evaluation are those of Gymnasium and Stable-Baselines3. A run that was stopped starts again.
+The flags are those of ppo_colored_continuous.py, as far as they apply, and so are the files of a
+run but for checkpoint.pt: a run that was stopped starts again. Environments, networks, rollout,
+update and evaluation are those of Gymnasium and Stable-Baselines3, the noise is pink-noise-rl's.
 """
 
 import sys
 
 import gymnasium as gym
 import numpy as np
+import shimmy  # noqa: F401  registers dm_control's ids
 import torch
 from pink import ColoredNoiseProcess
 from stable_baselines3 import PPO
@@ -22,11 +23,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 import ppo_colored_continuous as ppo
 
 SETTINGS = ["n_steps", "batch_size", "n_epochs", "learning_rate", "gamma", "gae_lambda"]
-SETTINGS += ["clip_range", "normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm"]
-# The other flags that take effect here; the rest must keep their defaults
-USED = {*SETTINGS, "env_id", "seed", "total_timesteps", "eval_freq", "eval_episodes", "beta"}
-USED |= {"noise_seq_len", "vanilla", "n_envs", "bootstrap_timeouts", "exp_name", "runs_dir"}
-USED |= {"overwrite", "method"}
+SETTINGS += ["clip_range", "normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm", "seed"]
+# The other flags that have an effect here
+USED = {*SETTINGS, "env_id", "n_envs", "bootstrap_timeouts", "vanilla", "beta", "noise_seq_len"}
+USED |= {"total_timesteps", "eval_freq", "eval_episodes", "exp_name", "runs_dir", "overwrite"}
 
 
 class ColoredGaussian(DiagGaussianDistribution):
@@ -42,39 +42,32 @@ class ColoredGaussian(DiagGaussianDistribution):
 
 
 class EndAtTimeLimit(gym.Wrapper):
-    """A time limit is an ordinary end, as in the paper's dm_control: no bootstrap."""
+    """A time limit is the end of the task, as in the paper's dm_control: no bootstrap there."""
 
     def step(self, action):
         obs, reward, terminated, truncated, info = self.env.step(action)
         return obs, reward, terminated or truncated, False, info
 
 
-def make_model(args):
-    """Stable-Baselines3's PPO, with white noise of its own if args.vanilla; and its environments.
-
-    Returns the model and as many environments for evaluation as there are episodes in one.
-    """
-    if args.env_id.startswith("dm_control/"):
-        import shimmy  # noqa: F401  registers the ids
-
+def make_envs(args, n_envs, seed=None):
     def wrap(env):
         env = gym.wrappers.FlattenObservation(env)
         return env if args.bootstrap_timeouts else EndAtTimeLimit(env)
 
-    env_seed, eval_seed, noise_seed = ppo.make_seeds(3, args.seed, 5)
-    envs = make_vec_env(args.env_id, args.n_envs, seed=env_seed, wrapper_class=wrap)
-    eval_envs = make_vec_env(args.env_id, args.eval_episodes, seed=eval_seed, wrapper_class=wrap)
+    return make_vec_env(args.env_id, n_envs, seed=seed, wrapper_class=wrap)
+
+
+def make_model(args):
+    """Stable-Baselines3's PPO with its environments. It draws white noise if args.vanilla."""
     settings = {name: getattr(args, name) for name in SETTINGS}
-    model = PPO("MlpPolicy", envs, seed=args.seed, device="cpu", **settings)
+    # PPO seeds the environments, with `seed`, `seed` + 1, ...
+    model = PPO("MlpPolicy", make_envs(args, args.n_envs), device="cpu", **settings)
     if not args.vanilla:
-        action_dim, [beta] = model.action_space.shape[0], args.beta
-        shape, rng = (
-            (args.n_envs, action_dim, args.noise_seq_len),
-            np.random.default_rng(noise_seed),
-        )
-        noise = ColoredNoiseProcess(beta, shape, rng=rng)
+        [beta], action_dim = args.beta, model.action_space.shape[0]
+        rng = np.random.default_rng([args.seed, 0])
+        noise = ColoredNoiseProcess(beta, (args.n_envs, action_dim, args.noise_seq_len), rng=rng)
         model.policy.action_dist = ColoredGaussian(noise, action_dim)
-    return model, eval_envs
+    return model
 
 
 def parse_args(argv):
@@ -82,9 +75,9 @@ def parse_args(argv):
     args = ppo.parse_args(argv, **defaults)
     for name, value in vars(ppo.parse_args([], **defaults)).items():
         if name not in USED and getattr(args, name) != value:
-            sys.exit(f"study.sb3 has no --{name.replace('_', '-')}")
+            sys.exit(f"--{name.replace('_', '-')} has no effect in study.sb3: leave it out")
     if args.eval_freq % (args.n_envs * args.n_steps):
-        sys.exit("study.sb3 evaluates after updates: --eval-freq must be a multiple of their steps")
+        sys.exit("--eval-freq must be a multiple of n_envs * n_steps, the steps of an update")
     return args
 
 
@@ -95,12 +88,13 @@ def main(args):
         if run.complete:
             print(f"nothing was run, {run.path} is complete: use --overwrite or --exp-name NAME")
             return
-        model, eval_envs = make_model(args)
+        _, eval_seed = ppo.make_seeds(2, args.seed, 5)
+        model, eval_envs = make_model(args), make_envs(args, args.eval_episodes, eval_seed)
+        how = {"n_eval_episodes": args.eval_episodes, "return_episode_rewards": True}
         run.start()
         for step in range(args.eval_freq, args.total_timesteps + 1, args.eval_freq):
             model.learn(args.eval_freq, reset_num_timesteps=False)
-            how = {"n_eval_episodes": args.eval_episodes, "return_episode_rewards": True}
-            returns, lengths = map(np.array, evaluate_policy(model, eval_envs, **how, warn=False))
+            returns, lengths = map(np.array, evaluate_policy(model, eval_envs, **how))
             run.add_evaluation(step, returns, lengths, {"agent": model.policy})
         run.finish(model.num_timesteps)
 
