@@ -1,4 +1,4 @@
-"""How long a training step takes, and what it is made of: the script beside its peers.
+"""How long a training step takes, and what it is made of: the script beside the paper's own stack.
 
     pip install -r requirements.txt -r tests/requirements.txt && python -m study.benchmark
 
@@ -7,10 +7,8 @@ evaluates 50 episodes, in a process of its own. All are held on one core, since 
 has in a sweep that keeps every core busy. They take turns: a round is one update and one evaluation
 of each. The table has medians over rounds in microseconds per training step, evaluations weighted
 as in the protocol (one per 10,240 steps). The first round is not counted: torch.compile is in it.
-Start-up is the time until it begins. Policies are as they are after a few updates. "files" is
-logging, evaluations.csv and a checkpoint (here in each round, in a run after 5 seconds). Bare
-physics is the simulator alone, called from Python: as many control steps as the protocol has, with
-random actions in training, none in evaluation.
+Policies are as they are after a few updates. "files" is logging, evaluations.csv and a checkpoint
+(here in each round, in a run every 5 seconds).
 
 More tables: the training alone by number of environments; a run by number of threads, no longer
 held on one core; and the seconds that one waits before the first training step.
@@ -18,7 +16,6 @@ held on one core; and the seconds that one waits before the first training step.
 
 import argparse
 import collections
-import functools
 import multiprocessing
 import os
 import resource
@@ -29,14 +26,15 @@ import time
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["TQDM_DISABLE"] = "1"
 
-# A round of a contender: one update of n_envs * n_steps steps, and one evaluation
-Size = collections.namedtuple("Size", "n_envs n_steps eval_episodes", defaults=(4, 2048, 50))
+import pandas as pd
+
 EVAL_FREQ, TOTAL_STEPS = 10_240, 2_048_000  # of the protocol
+EACH_ROUND = "--eval-freq 8192"  # an evaluation after each update
 PHASES = ["rollout", "noise", "update", "files", "evaluation"]
 DM_CONTROL = [f"dm_control/{t}-v0" for t in ("pendulum-swingup", "cheetah-run", "walker-run")]
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
-PAPER, PHYSICS = "the paper's stack", "bare physics"
 ROOT = Path(__file__).parent.parent
 
 
@@ -65,227 +63,121 @@ class Clock:
 
         return timed_function
 
-    def next_round(self):
-        """Reports seconds and peak memory since the last call, waits, and begins a rollout."""
+    def next_round(self, args):
+        """Reports microseconds per training step and peak memory, waits, and begins a rollout."""
         self.switch(None)
+        row = {phase: 1e6 * self.seconds[phase] / (args.n_envs * args.n_steps) for phase in PHASES}
+        row["evaluation"] = 1e6 * self.seconds["evaluation"] / EVAL_FREQ  # one in each round
         unit = 2**20 if sys.platform == "darwin" else 2**10
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-        self.pipe.send({**{phase: self.seconds[phase] for phase in PHASES}, "peak MB": peak})
+        self.pipe.send(row | {"total us": sum(row.values()), "peak MB": peak})
         if not self.pipe.recv():
             sys.exit()
         self.seconds.clear()
         self.phase, self.since = "rollout", time.perf_counter()
 
 
-# --- The contenders: functions of a clock, an environment's id and a Size
+# --- The contenders: functions of a clock and the script's flags
 
 
-def run_script(clock, env_id, size, flags="", evaluations=True):
+def run_script(clock, flags):
     """The script itself, with timers around the functions that its loop calls."""
     import ppo_colored_continuous as ppo
 
-    def exploration(*args):  # the first thing of a round
-        clock.next_round()
-        return ppo.exploration(*args)
+    args = ppo.parse_args(flags.split())
+
+    def exploration(*arguments):  # called first in each round
+        clock.next_round(args)
+        return ppo.exploration(*arguments)
 
     ppo.evaluate = clock.timed("evaluation", ppo.evaluate)
     ppo.ColoredNoiseProcess.sample = clock.timed("noise", ppo.ColoredNoiseProcess.sample)
     for name in ("add_evaluation", "add_update", "save_checkpoint"):
         setattr(ppo.Run, name, clock.timed("files", getattr(ppo.Run, name)))
-    eval_freq = size.n_envs * size.n_steps if evaluations else TOTAL_STEPS
-    episodes = size.eval_episodes if evaluations else 1
-    with tempfile.TemporaryDirectory() as folder:
-        settings = f"--env-id {env_id} --n-envs {size.n_envs} --n-steps {size.n_steps} {flags} "
-        settings += f"--eval-freq {eval_freq} --eval-episodes {episodes} --runs-dir {folder}"
-        args = ppo.parse_args(settings.split(), total_timesteps=TOTAL_STEPS)
+    with tempfile.TemporaryDirectory() as args.runs_dir:
         ppo.main(args, exploration=exploration, learn=clock.timed("update", ppo.learn))
 
 
-def run_peer(clock, env_id, size, jax=False):
-    """PPO of Stable-Baselines3 or SBX, noise of pink-noise-rl, evaluated in 10 environments."""
-    import gymnasium as gym
-    import numpy as np
-    import shimmy  # noqa: F401  registers the dm_control ids
+def run_sb3(clock, flags):
+    """The paper's stack: Stable-Baselines3 with pink-noise-rl, evaluated in 10 environments."""
     import torch
-    from pink import ColoredNoiseProcess
-    from stable_baselines3.common import callbacks
-    from stable_baselines3.common.env_util import make_vec_env
 
-    if jax:
-        from sbx import PPO  # pip install sbx-rl
-    else:
-        from stable_baselines3 import PPO
+    from study import sb3
 
     torch.set_num_threads(1)
-    flatten = gym.wrappers.FlattenObservation
-    make = functools.partial(make_vec_env, env_id, seed=1, wrapper_class=flatten)
-    settings = dict(n_steps=size.n_steps, batch_size=128, n_epochs=10, learning_rate=2.5e-4)
-    model = PPO("MlpPolicy", make(n_envs=size.n_envs), seed=1, **settings)
-    shape = (size.n_envs, model.action_space.shape[0], 1000)
-    noise = ColoredNoiseProcess(0.5, shape, rng=np.random.default_rng(1))
-    (color_jax if jax else color_torch)(model.policy, noise)
+    args = sb3.parse_args(flags.split())
+    model, eval_envs = sb3.make_model(args), sb3.make_envs(args, 10, seed=1)
     model.train = clock.timed("update", model.train)
-    callbacks.evaluate_policy = clock.timed("evaluation", callbacks.evaluate_policy)
-    how = dict(n_eval_episodes=size.eval_episodes, eval_freq=size.n_steps, verbose=0)
-    evaluation = callbacks.EvalCallback(make(n_envs=10), **how)
+    evaluate = clock.timed("evaluation", sb3.evaluate_policy)
     while True:
-        clock.next_round()
-        model.learn(size.n_envs * size.n_steps, evaluation, reset_num_timesteps=False)
-
-
-def color_torch(policy, noise):
-    """Makes Stable-Baselines3's policy draw from the noise, as the paper's code does."""
-    import torch
-    from stable_baselines3.common.distributions import DiagGaussianDistribution
-
-    class ColoredGaussian(DiagGaussianDistribution):
-        def sample(self):
-            eps = torch.as_tensor(noise.sample(), dtype=torch.float32)
-            return self.distribution.mean + self.distribution.stddev * eps
-
-    policy.action_dist = ColoredGaussian(policy.action_space.shape[0])
-
-
-def color_jax(policy, noise):
-    """The same for SBX, in its one compiled function that acts."""
-    import jax
-
-    @jax.jit
-    def predict_all(actor_state, vf_state, obs, eps):
-        dist = actor_state.apply_fn(actor_state.params, obs)
-        actions = dist.mean() + dist.stddev() * eps
-        values = vf_state.apply_fn(vf_state.params, obs).flatten()
-        return actions, dist.log_prob(actions), values
-
-    policy.predict_all = lambda obs, key: predict_all(
-        policy.actor_state, policy.vf_state, obs, noise.sample().astype("float32")
-    )
-
-
-def run_physics(clock, env_id, size):
-    """mj_step on a dm_control task's model, with its substeps; resets are not counted."""
-    if not env_id.startswith("dm_control/"):
-        raise ValueError("it knows only dm_control's models")
-    import mujoco
-    import numpy as np
-    from dm_control import suite
-
-    env = suite.load(*env_id.removeprefix("dm_control/").removesuffix("-v0").split("-"))
-    model, data = env.physics.model.ptr, env.physics.data.ptr
-    n_substeps = round(env.control_timestep() / model.opt.timestep)
-    episode_length = round(env._step_limit)
-    random = np.random.default_rng(1).normal(size=(episode_length, model.nu)).clip(-1, 1)
-
-    def simulate(n_steps, actions):
-        for t in range(n_steps):
-            if t % episode_length == 0:
-                clock.timed(None, env.reset)()
-            data.ctrl[:] = actions[t % episode_length]
-            mujoco.mj_step(model, data, n_substeps)
-
-    while True:
-        clock.next_round()
-        simulate(size.n_envs * size.n_steps, random)
-        clock.timed("evaluation", simulate)(size.eval_episodes * episode_length, 0 * random)
+        clock.next_round(args)
+        model.learn(args.n_envs * args.n_steps, reset_num_timesteps=False)
+        evaluate(model, eval_envs, args.eval_episodes)
 
 
 # --- Measuring
 
 
-def contend(pipe, run, env_id, size):
-    """What a contender's process does: runs, silently, and reports why where it cannot."""
-    sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-    try:
-        run(Clock(pipe), env_id, size)
-    except (Exception, SystemExit) as error:
-        pipe.send(f"{type(error).__name__}: {error}")
+def contend(run, pipe, flags):
+    """What a contender's process does."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    run(Clock(pipe), flags)
 
 
-def measure(env_id, contenders, n_rounds, size):
-    """Lets contenders, {name: run}, play a round that is not counted and n_rounds, in turns.
+def measure(env_id, n_envs, n_rounds, contenders):
+    """Lets contenders, {name: (run, flags)}, play rounds in turns: one, then n_rounds that count.
 
-    Returns a list of table rows, of those that can run.
+    Returns a row for each: medians over rounds, and the smallest and largest total.
     """
-
-    def receive(name):
-        try:
-            result = pipes[name].recv()
-        except EOFError:
-            result = "its process has died: not enough memory?"
-        if isinstance(result, str):
-            print(f"note: nothing of {name} on {env_id} ({result})", file=sys.stderr)
-            del pipes[name]
-        return result
-
-    context = multiprocessing.get_context("spawn")
-    pipes, processes, startup, rounds = {}, {}, {}, collections.defaultdict(list)
-    for name, run in contenders.items():
+    context, rounds = multiprocessing.get_context("spawn"), collections.defaultdict(list)
+    pipes, processes = {}, []
+    for name, (run, flags) in contenders.items():
         pipes[name], pipe = context.Pipe()
-        arguments = (pipe, run, env_id, size)
-        processes[name] = context.Process(target=contend, args=arguments, daemon=True)
-        start = time.perf_counter()
-        processes[name].start()
-        pipe.close()  # here: the process has its own, and its death ends recv
-        receive(name)
-        startup[name] = time.perf_counter() - start
+        arguments = run, pipe, f"--env-id {env_id} --n-envs {n_envs} {flags}"
+        processes.append(context.Process(target=contend, args=arguments, daemon=True))
+        processes[-1].start()
+        pipe.close()  # so that recv raises EOFError where the process has died
+        pipes[name].recv()  # it has started
     for _ in range(1 + n_rounds):
-        for name in list(pipes):
-            pipes[name].send(True)
-            rounds[name].append(receive(name))
-    for name, pipe in pipes.items():
+        for name, pipe in pipes.items():
+            pipe.send(True)
+            rounds[name].append(pipe.recv())
+    for pipe, process in zip(pipes.values(), processes, strict=True):
         pipe.send(False)
-        processes[name].join()
+        process.join()
     rows = []
-    for name in pipes:
-        about = {"env_id": env_id, "contender": name, "n_envs": size.n_envs}
-        medians = summary(rounds[name][1:], size)
-        rows.append({**about, **medians, "start-up s": startup[name]})
+    for name, reports in rounds.items():
+        table = pd.DataFrame(reports[1:])
+        row = {"env_id": env_id, "contender": name, "n_envs": n_envs, **table.median()}
+        rows.append(row | {"from": table["total us"].min(), "to": table["total us"].max()})
     return rows
-
-
-def summary(rounds, size):
-    """A contender's medians over its rounds: microseconds per training step, peak memory."""
-    import pandas as pd
-
-    table, steps = pd.DataFrame(rounds), size.n_envs * size.n_steps
-    table[PHASES] *= 1e6 / steps
-    table["evaluation"] *= steps / EVAL_FREQ  # a round has one, the protocol one per EVAL_FREQ
-    total = table[PHASES].sum(axis=1)
-    return {**table.median(), "total us": total.median(), "from": total.min(), "to": total.max()}
 
 
 # --- The tables: generators of lists of rows
 
 
 def phases(args):
-    """All contenders on each environment, with ratios of the totals."""
-    script, other = functools.partial(run_script, flags="--threads 1"), "--threads 1 --no-envpool"
+    """The script and the paper's stack on each environment, with ratios of the totals."""
     contenders = {
-        "this script": script,
-        "this script, --no-envpool": functools.partial(run_script, flags=other),
-        PAPER: run_peer,
-        "SBX": functools.partial(run_peer, jax=True),
-        PHYSICS: run_physics,
+        "this script": (run_script, f"{EACH_ROUND} --threads 1"),
+        "this script, --no-envpool": (run_script, f"{EACH_ROUND} --threads 1 --no-envpool"),
+        "the paper's stack": (run_sb3, EACH_ROUND),
     }
     for env_id in args.env_ids or DM_CONTROL:
-        rows = measure(env_id, contenders, args.rounds, args.size)
-        totals = {row["contender"]: row["total us"] for row in rows}
-        for row in rows:
-            row["x faster"] = totals.get(PAPER, float("nan")) / row["total us"]
-            row["x physics"] = row["total us"] / totals.get(PHYSICS, float("nan"))
-        yield rows
+        rows = measure(env_id, 4, args.rounds, contenders)
+        yield [row | {"x faster": rows[-1]["total us"] / row["total us"]} for row in rows]
 
 
 def n_envs(args):
     """The script's training, without evaluations, with each number of environments."""
+    flags = f"--threads 1 --eval-freq {TOTAL_STEPS} --eval-episodes 1"
+    contenders = {
+        "training": (run_script, flags),
+        "training, --no-envpool": (run_script, f"{flags} --no-envpool"),
+    }
     for env_id in args.env_ids or DM_CONTROL[:1]:
-        rows = []
-        for n in (1, 4, 16, 64, 128):
-            for name, flags in [("--threads 1", ""), ("--no-envpool", "--no-envpool")]:
-                how = {"flags": f"--threads 1 {flags}", "evaluations": False}
-                contender = {f"training, {name}": functools.partial(run_script, **how)}
-                rows += measure(env_id, contender, 1, args.size._replace(n_envs=n))
-        yield rows
+        tables = [measure(env_id, n, args.rounds, contenders) for n in (1, 4, 16, 64, 128)]
+        yield sum(tables, [])
 
 
 def threads(args):
@@ -294,16 +186,15 @@ def threads(args):
         rows = []
         for n in sorted({1, len(CORES)}):
             hold_on_cores(n)
-            run = functools.partial(run_script, flags=f"--threads {n}")
-            contender = {f"one run, {n} core{'s'[: n > 1]}": run}
-            rows += measure(env_id, contender, args.rounds, args.size)
+            contender = {f"one run, --threads {n}": (run_script, f"{EACH_ROUND} --threads {n}")}
+            rows += measure(env_id, 4, args.rounds, contender)
         yield [row | {"minutes": row["total us"] * TOTAL_STEPS / 60e6} for row in rows]
 
 
 # A run that ends with its first minibatch, and the same with an edited loss
 SCRIPT = "ppo_colored_continuous"
 FIRST_STEP = f"{SCRIPT}.py --n-envs 4 --n-steps 32 --n-epochs 1 --total-timesteps 128 "
-FIRST_STEP += "--eval-freq 128 --eval-episodes 1 --overwrite"
+FIRST_STEP += "--eval-freq 128 --eval-episodes 1 --overwrite --compile"
 EDITED = f"""import sys, {SCRIPT} as ppo
 def edited_loss(*args):
     loss, metrics = ppo.ppo_loss(*args)
@@ -313,8 +204,6 @@ ppo.main(ppo.parse_args(sys.argv[2:]), loss=edited_loss)"""
 
 def waiting(args):
     """Seconds until the first training step is done, and of what comes before it, on all cores."""
-    import pandas as pd
-
     hold_on_cores(len(CORES))
     python, rounds = sys.executable, []
     for _ in range(args.rounds):
@@ -354,24 +243,18 @@ TABLES = {table.__name__: table for table in (phases, n_envs, threads, waiting)}
 def parse_args(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     add = parser.add_argument
-    add("--tables", nargs="+", choices=TABLES, default=TABLES, help="which to make")
-    add("--env-ids", nargs="+", help="in place of those that each table has")
-    add("--rounds", type=int, default=3, help="that count")
-    add("--csv", type=Path, default="benchmark.csv", help="file for the rows of all tables")
-    args = parser.parse_args(argv)
-    args.size = Size()
-    if not args.csv.absolute().parent.is_dir():
-        parser.error(f"--csv {args.csv}: there is no such folder")
-    return args
+    add("--tables", nargs="+", choices=TABLES, default=TABLES, help="tables to make")
+    add("--env-ids", nargs="+", help="environments, in place of those of each table")
+    add("--rounds", type=int, default=3, help="rounds that are counted")
+    add("--csv", default="benchmark.csv", help="file for the rows of all tables")
+    return parser.parse_args(argv)
 
 
 def main(args):
-    import pandas as pd
-
     rows = []
     for name in args.tables:
         hold_on_cores(1)
-        for table in filter(None, TABLES[name](args)):  # where it is empty, notes have said why
+        for table in TABLES[name](args):
             rows += table
             pd.DataFrame(rows).round(3).to_csv(args.csv, index=False)
             shown = pd.DataFrame(table).to_string(index=False, float_format="{:.2f}".format)

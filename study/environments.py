@@ -37,31 +37,21 @@ for env_id in NAMES:
 gym.register("door-v0", "study.environments:make_door", max_episode_steps=200)
 
 
-def make_door(render_mode=None, **kwargs):
+def make_door(**kwargs):
     """Makes D4RL's `door-v0` from AdroitHandDoor-v1 of gymnasium-robotics; kwargs are its.
 
     That rewards the distance between palm and handle with +0.1 per m, D4RL with -0.1.
     """
     with contextlib.redirect_stderr(io.StringIO()):  # importing the package prints a notice
         from gymnasium_robotics.envs.adroit_hand.adroit_door import AdroitHandDoorEnv
-    import mujoco
 
     class AdroitDoor(AdroitHandDoorEnv):
-        def _initialize_simulation(self):
-            if render_mode is not None:
-                return super()._initialize_simulation()
-            # Meshes and textures that are only seen take 6.7 of the model's 6.8 MB
-            spec = mujoco.MjSpec.from_file(self.fullpath)
-            spec.compiler.discardvisual = True
-            model = spec.compile()
-            return model, mujoco.MjData(model)
-
         def step(self, action):
             obs, reward, terminated, truncated, info = super().step(action)
             palm_to_handle = math.hypot(*obs[-4:-1])
             return obs, reward - 0.2 * palm_to_handle, terminated, truncated, info
 
-    return AdroitDoor(reward_type="dense", render_mode=render_mode, **kwargs)
+    return AdroitDoor(reward_type="dense", **kwargs)
 
 
 # --- Pictures and messages
@@ -69,8 +59,8 @@ def make_door(render_mode=None, **kwargs):
 
 def prepare_rendering():
     """Lets MuJoCo and pygame render without a display; call it before the environment is made."""
-    displays = ("DISPLAY", "WAYLAND_DISPLAY")
-    if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not display:
         os.environ.setdefault("MUJOCO_GL", "egl")
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # or pygame complains without sound
@@ -89,9 +79,9 @@ def quiet_packages():
 
 @contextlib.contextmanager
 def tiny_textures():
-    """Models of dm_control's suite that are made meanwhile have a sky and a floor of few pixels.
+    """Tasks of dm_control that are made in this context have a sky and a floor of few pixels.
 
-    These take 12 MB of memory in each environment, and matter to pictures alone.
+    These take 12 MB of memory in each environment, and only pictures need them.
     """
     from dm_control.suite import common
 
@@ -110,17 +100,20 @@ def one_pixel_wide(xml):
 
 # --- Environments of Gymnasium, stepped by threads where that helps
 
-# Environments that share nothing, and whose step is mostly MuJoCo's, so that other threads of
-# Python run meanwhile. Measured with 50 environments, us a step with 1 and 2 threads: swimmer maze
-# 36 and 21, but point maze 20 and 27. With EnvPool, cheetah 12.2 and 6.5, walker 101 and 66; no
-# gain in pendulum, whose physics is too quick.
+# Tasks whose environments share no state, and whose step is mostly MuJoCo's, which runs in parallel
+# with other threads. Microseconds per step with 1 and 2 threads, of 50 environments: swimmer maze
+# 36 and 21, but point maze 20 and 27. With EnvPool: cheetah 12.2 and 6.5, walker 101 and 66, but
+# no gain in pendulum, whose physics is too quick.
 GAIN_BY_THREADS = {env_id for env_id in NAMES if env_id.startswith(("Ant", "Swimmer"))}
 GAIN_BY_THREADS |= {"dm_control/cheetah-run-v0", "dm_control/walker-run-v0", "door-v0"}
 GAIN_BY_THREADS |= {"dm_control/hopper-hop-v0", "dm_control/ball_in_cup-catch-v0"}
 
 
 def make_vector_env(args, n_envs, make_env):
-    """n_envs environments of make_env(args), with SAME_STEP autoreset, and threads if they help."""
+    """Makes n_envs environments by make_env(args), with SAME_STEP autoreset.
+
+    They are stepped by args.threads threads if the task gains by it.
+    """
     quiet_packages()
     is_suite = args.env_id.startswith("dm_control/")
     with tiny_textures() if is_suite else contextlib.nullcontext():
@@ -136,9 +129,9 @@ def sync_vector_env(envs):
 
 
 class ThreadedVectorEnv(VectorWrapper):
-    """A SyncVectorEnv, but for step, in which each of n_threads threads steps a part of it.
+    """A SyncVectorEnv, except that n_threads threads step it, each a part of the environments.
 
-    Results are the same bit for bit, if the environments share no state.
+    Results are the same bit for bit if the environments share no state.
     """
 
     def __init__(self, envs, n_threads):
@@ -178,25 +171,25 @@ ENVPOOL_TASKS = {
 
 
 def envpool_suits(args):
-    """Whether EnvPool is installed and has this task as the arguments say, without importing it."""
-    has_task = args.env_id in ENVPOOL_TASKS and not changes_task(args)
+    """Whether EnvPool is installed and has the task with these arguments. Does not import it."""
+    changed = args.max_episode_steps or args.env_kwargs
+    has_task = args.env_id in ENVPOOL_TASKS and not changed
     return has_task and importlib.util.find_spec("envpool") is not None
 
 
-def changes_task(args):
-    return args.max_episode_steps is not None or bool(args.env_kwargs)
-
-
 class EnvPoolVectorEnv(VectorEnv):
-    """The same tasks from EnvPool, in C++: what make_vector_env promises, with other seeds."""
+    """The same tasks from EnvPool, in C++, as a vector environment with SAME_STEP autoreset.
+
+    The same seed does not give the same episodes as in Gymnasium's environments.
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, args, n_envs):
-        if args.env_id not in ENVPOOL_TASKS or changes_task(args):
+        if not envpool_suits(args):
             raise ValueError(
-                f"EnvPool does not have {args.env_id} with these flags: use --no-envpool (it has "
-                f"{', '.join(ENVPOOL_TASKS)}, without --max-episode-steps and --env-kwargs)"
+                f"EnvPool is not installed, or does not have {args.env_id}, or not with "
+                "--max-episode-steps or --env-kwargs: use --no-envpool"
             )
         import envpool
 
@@ -228,11 +221,10 @@ class EnvPoolVectorEnv(VectorEnv):
         return self._obs.copy(), {}
 
     def step(self, actions):
-        # Actions of another shape would make the C++ read on past the end
-        actions = np.reshape(actions, self.action_space.shape)
-        actions = np.asarray(actions, self._action_dtype, order="C")
-        # The two functions that EnvPool's step() calls; the rest of it takes as long as the physics
-        # of four pendulums
+        # EnvPool does not check the shape, and would read other memory
+        actions = np.asarray(actions, self._action_dtype, "C").reshape(self.action_space.shape)
+        # These two functions are what EnvPool's step() calls. The rest of step() takes as long as
+        # the physics of four pendulums.
         self._pool._send([self._indices, self._indices, actions])
         state = self._receive()
         self._obs, rewards, truncated = state["obs"], state["reward"], state["trunc"]
@@ -251,9 +243,9 @@ class EnvPoolVectorEnv(VectorEnv):
         return self._obs, rewards, terminated, truncated, {"final_obs": final_obs}
 
     def _make_pool(self, seeds):
-        """Makes EnvPool's environments from models without what only pictures show.
+        """Makes EnvPool's environments, from models without what only pictures need.
 
-        With it each takes 13 MB of memory in dm_control's tasks instead of 1, and 8 in the door.
+        This saves 12 MB of memory per environment in dm_control's tasks, 7 in the door.
         seeds: (n_envs,) int32.
         """
         import envpool
@@ -268,7 +260,7 @@ class EnvPoolVectorEnv(VectorEnv):
                     copy.parent.mkdir(parents=True, exist_ok=True)
                     if file.name in ("skybox.xml", "materials.xml"):
                         copy.write_bytes(one_pixel_wide(file.read_bytes()))
-                    elif file.name == "adroit_assets.xml":
+                    elif file.name == "adroit_assets.xml":  # of the door
                         lean = b'<compiler discardvisual="true" '
                         copy.write_bytes(file.read_bytes().replace(b"<compiler ", lean))
                     else:
@@ -277,7 +269,7 @@ class EnvPoolVectorEnv(VectorEnv):
             return envpool.make_gymnasium(task, seed=seeds, base_path=folder, **options)
 
     def _begin_episodes(self, chosen):
-        """chosen: (n_envs,) bool."""
+        """Resets the chosen environments, (n_envs,) bool."""
         if chosen.any():
             self._pool._reset(self._indices[chosen])
             self._obs[chosen] = self._receive()["obs"]

@@ -2,13 +2,12 @@
 
 An ant, a point or a swimmer has to find a goal in a maze of square cells, in some mazes by pushing
 blocks out of its way. The original package needs gym and mujoco-py, which are no longer maintained.
-This file needs neither. It follows the tasks of version 1, which have a sparse reward at the goal,
-as they were before the package moved to gym 0.26.
+This file needs neither. It has the tasks of version 1, with a sparse reward at the goal.
 
     gymnasium.make("AntUMaze-v1")       # after `import study.environments`, which registers the ids
     MazeEnv(robot="ant", maze="UMaze")  # the same, without the limit of 1000 steps
 
-The robots are the XML models that Gymnasium ships; `build_model` changes what differs from them.
+The robots are the XML models in Gymnasium; `build_model` changes what differs in mujoco-maze.
 """
 
 import math
@@ -87,18 +86,8 @@ MAZES = {
 }
 
 
-class Robot(NamedTuple):
-    nq: int  # coordinates of the robot; those of the blocks follow
-    nv: int
-    timestep: float  # s
-    substeps: int  # of the physics per environment step
-
-
-ROBOTS = {
-    "ant": Robot(15, 14, 0.02, 5),
-    "point": Robot(3, 3, 0.02, 1),
-    "swimmer": Robot(5, 5, 0.01, 4),
-}
+# Seconds per step of the physics, and its steps per step of the environment
+TIMESTEPS = {"ant": (0.02, 5), "point": (0.02, 1), "swimmer": (0.01, 4)}
 
 
 def read_grid(grid, scale):
@@ -119,7 +108,7 @@ def build_model(robot, cells, scale, goal, old_capsule_inertia=True):
     """
     assets = Path(gym.__file__).parent / "envs/mujoco/assets"
     spec = mujoco.MjSpec.from_file(str(assets / f"{robot}.xml"))
-    spec.option.timestep = ROBOTS[robot].timestep
+    spec.option.timestep, _ = TIMESTEPS[robot]
     # The midphase of collision detection is newer than the study's MuJoCo 2.1.0. Without it the
     # ant's steps are the same in 10 % less time. The point's contacts come in another order: with
     # it 1.2 % of the point's steps at walls end elsewhere, by up to 2 cm and 2 m/s.
@@ -264,15 +253,14 @@ class MazeEnv(gym.Env):
     robot's other coordinates, its velocities, 0.001 * step.
     Reward: 1 within 0.6 m of the goal, which terminates the episode, otherwise -0.0001; for ant and
     swimmer also 0.01 * (speed in m/s - 1e-4 * sum(action^2)).
-    Info: `success`, whether the goal is reached; `position`, the robot's (x, y) in m; for ant and
-    swimmer `reward_forward` and `reward_ctrl`, the speed and -1e-4 * sum(action^2).
+    Info: `success`, whether the goal is reached.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}
 
     def __init__(self, robot, maze, goal=None, old_capsule_inertia=True, render_mode=None):
         self.robot, self.render_mode = robot, render_mode
-        self.nq, self.nv, timestep, self.substeps = ROBOTS[robot]
+        timestep, self.substeps = TIMESTEPS[robot]
         self.dt = timestep * self.substeps
         self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         scale = MAZES[maze].scale[robot]
@@ -282,7 +270,9 @@ class MazeEnv(gym.Env):
         self.faces = wall_faces(self.cells, scale)
         self.model = build_model(robot, self.cells, scale, self.goal, old_capsule_inertia)
         self.data = mujoco.MjData(self.model)
-        self.n_blocks = (self.model.nq - self.nq) // 2  # the last bodies, with 2 joints each
+        self.n_blocks = sum(c == "M" for c, _, _ in self.cells)
+        # Of the robot. The coordinates of the blocks follow, two for each
+        self.nq, self.nv = self.model.nq - 2 * self.n_blocks, self.model.nv - 2 * self.n_blocks
 
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
@@ -307,24 +297,19 @@ class MazeEnv(gym.Env):
     def step(self, action):
         """One step of `dt` seconds with an action of shape (action_dim,)."""
         action = np.minimum(np.maximum(action, self._low), self._high)
-        square = float(action @ action)
         self._steps += 1
-        qpos, info = self.data.qpos, {}  # a view: it shows each new state
+        start, position = self.data.qpos[:2].tolist(), self.data.qpos[:2]  # a view
         if self.robot == "point":
             self._move_point(*action.tolist())
             reward = 0.0
         else:
-            x, y = qpos[:2].tolist()
             self.data.ctrl[:] = action
             mujoco.mj_step(self.model, self.data, self.substeps)
-            speed = math.hypot(qpos[0] - x, qpos[1] - y) / self.dt
-            info = {"reward_forward": speed, "reward_ctrl": -CONTROL_COST * square}
-            reward = INNER_REWARD * (speed - CONTROL_COST * square)
-        x, y = qpos[:2].tolist()
-        reached = math.hypot(x - self.goal[0], y - self.goal[1]) <= GOAL_RADIUS
+            speed = math.dist(position, start) / self.dt
+            reward = INNER_REWARD * (speed - CONTROL_COST * float(action @ action))
+        reached = math.dist(position, self.goal) <= GOAL_RADIUS
         reward += 1.0 if reached else STEP_REWARD
-        info |= {"success": reached, "position": np.array([x, y])}
-        return self._observation(), reward, reached, False, info
+        return self._observation(), reward, reached, False, {"success": reached}
 
     def _move_point(self, forward, turn):
         """Turns the point and moves it forward, steps the physics, then reflects it at walls."""

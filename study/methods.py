@@ -4,9 +4,9 @@
     python -m study.methods a2c --beta 0.5      Sec. A7: A2C with colored noise
     python -m study.methods gsde                Sec. A13: PPO with state-dependent exploration
 
-All flags of the script hold (--help), but those that the method does not have. None of this is in
-the paper's released code, and its text gives no hyperparameters, so the defaults are those of
-Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
+The flags are those of ppo_colored_continuous.py, except a few that do not apply. The paper gives no
+hyperparameters for these methods, and its released code does not have them. The defaults are those
+of Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
 """
 
 import argparse
@@ -60,10 +60,10 @@ def flat_gradient(value, params, **kwargs):  # one vector, like parameters_to_ve
 
 
 def trpo_actor(agent, batch):
-    """The actor's step: moves the agent's parameters, or not; returns what is to be logged.
+    """The actor's step: changes its parameters, unless no step is accepted. Returns metrics to log.
 
-    The KL divergence is of the new policy || the old one, the mean over observations and, as in
-    sb3-contrib, action dimensions: that of a single one.
+    The KL divergence is KL(new policy || old policy), averaged over observations and, as in
+    sb3-contrib, over action dimensions.
     """
     obs, actions, old_logprobs, advantages, *_ = batch
     params = [p for p in (*agent.actor_mean.parameters(), agent.log_std) if p.requires_grad]
@@ -98,7 +98,7 @@ def trpo_actor(agent, batch):
 
 
 def critic_loss(agent, minibatch, args):
-    """The critic's only: its gradient is zero for the other parameters, which Adam leaves alone."""
+    """The loss of the critic alone. Other parameters get zero gradients, so Adam keeps them."""
     obs, _, _, _, returns, _ = minibatch
     loss = ((returns - agent.critic(obs).squeeze(-1)) ** 2).mean()
     return loss, {"value_loss": loss}
@@ -113,7 +113,7 @@ def trpo_learn(agent, optimizer, batch, gradients, args):
     return ppo.learn(agent, optimizer, batch, gradients, args) | metrics
 
 
-# --- gSDE (Raffin et al. 2021): noise that is a function of the state, the same for a whole rollout
+# --- gSDE (Raffin et al. 2021): noise that is a function of the state, one function per rollout
 
 
 class GSDEAgent(ppo.Agent):
@@ -124,10 +124,10 @@ class GSDEAgent(ppo.Agent):
         self.log_std = nn.Parameter(torch.zeros(self.actor_mean[-1].in_features, action_dim))
 
     def forward(self, obs, actions):
-        """As in Agent; the density of an action is that over all W."""
+        """As in Agent. The density is that of actions in this state, over all W."""
         hidden = self.actor_mean[:-1](obs)
         mean = self.actor_mean[-1](hidden)
-        variance = hidden.detach() ** 2 @ self.std() ** 2  # the noise trains log_std only
+        variance = hidden.detach() ** 2 @ self.std() ** 2  # detach: it trains log_std only
         policy = Normal(mean, (variance + 1e-6).sqrt(), validate_args=False)
         logprobs, entropy = policy.log_prob(actions).sum(-1), policy.entropy().sum(-1).mean()
         return logprobs, entropy, self.critic(obs).squeeze(-1)
@@ -146,7 +146,7 @@ def gsde_exploration(agent, noise, args):
     return act
 
 
-# --- What each method replaces, its defaults, and the script's flags that it does not have
+# --- What each method replaces, its defaults, and the script's flags that do not apply
 
 METHODS = {
     "a2c": dict(

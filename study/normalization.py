@@ -8,9 +8,9 @@ from gymnasium.wrappers.utils import RunningMeanStd
 class NormalizedVectorEnv(VectorWrapper):
     """Normalizes observations and rewards as VecNormalize of Stable-Baselines3 does.
 
-    Observations are brought to mean 0 and std 1 of all up to now. Rewards are divided by the std of
-    the discounted return up to now; their mean is part of the task and stays. Both are clipped to
-    [-10, 10]. The rewards as they were are in infos["raw_rewards"].
+    From observations the running mean is subtracted, and they are divided by the running std.
+    Rewards are divided by the running std of the discounted return; no mean is subtracted. Both are
+    clipped to [-10, 10]. The original rewards are in infos["raw_rewards"].
     """
 
     def __init__(self, env, args):
@@ -24,9 +24,9 @@ class NormalizedVectorEnv(VectorWrapper):
             self._statistics["returns"] = RunningMeanStd()
 
     def frozen(self, env):
-        """Another vector environment with this one's normalization of observations, to evaluate in.
+        """Wraps env, to evaluate in: observations are normalized by the statistics of this one.
 
-        It has no rewards normalized, and changes no statistics.
+        They are not updated there, and rewards are not normalized.
         """
         other = NormalizedVectorEnv(env, self._args)
         other._training = False

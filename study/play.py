@@ -5,10 +5,10 @@
     python -m study.play RUN --window --beta 1      with the exploration noise, of any color
 
 RUN is the folder of a run, finished or not, such as
-runs/ppo_colored_continuous/MountainCarContinuous-v0/beta_0.5/n_envs_4/seed_1. It is played in
-Gymnasium's environment, also if the run had EnvPool's.
+runs/ppo_colored_continuous/MountainCarContinuous-v0/beta_0.5/n_envs_4/seed_1. Its policy is played
+in Gymnasium's environment, even if it was trained in EnvPool's.
 
-In Python, `load_policy(RUN)` gives the policy as it acts, and an environment to play it in.
+In Python, `load_policy(RUN)` gives the policy and an environment to play it in.
 """
 
 import argparse
@@ -31,18 +31,15 @@ def parse_args(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run")
-    add("--episodes", type=int, help="how many (10; 1 with --video)")
-    add("--best", action="store_true", help="the policy that was evaluated best, not the last one")
-    add("--beta", type=float, nargs="+", help="explore with noise of this color, or one per action "
+    add("--episodes", type=int, help="number of episodes (10; 1 with --video)")
+    add("--best", action="store_true", help="play the policy of the best evaluation, not the last")
+    add("--beta", type=float, nargs="+", help="add exploration noise: one beta, or one per action "
         "dimension; without it the mean action is played")  # fmt: skip
     add("--seed", type=int, default=1, help="of the environment and the noise (1)")
     shown = parser.add_mutually_exclusive_group().add_argument
-    shown("--window", action="store_true", help="show it on the screen, at the speed of the task")
-    shown("--video", type=Path, metavar="FILE", help="write it to this file, name.mp4")
+    shown("--window", action="store_true", help="show the episodes in a window")
+    shown("--video", type=Path, metavar="FILE", help="write a video to this file, name.mp4")
     args = parser.parse_args(argv)
-    if not (args.run / "checkpoint.pt").exists():
-        parser.error(f"{args.run} is not the folder of a run that has begun to learn: it has no "
-                     "checkpoint.pt")  # fmt: skip
     args.episodes = args.episodes or (1 if args.video else 10)
     return args
 
@@ -55,8 +52,8 @@ def load_policy(run, best=False, beta=None, seed=1, render_mode=None):
 
     Args:
         run: folder of the run.
-        best: the policy of the best evaluation, not the last one.
-        beta: explore with noise of this color, a number or one per action dimension. None: none.
+        best: load the policy of the best evaluation, not the last one.
+        beta: of exploration noise to add, a number or one per action dimension. None: no noise.
         seed: of the noise.
         render_mode: None, "rgb_array" for pictures, "human" for a window.
 
@@ -67,7 +64,7 @@ def load_policy(run, best=False, beta=None, seed=1, render_mode=None):
         step: the environment step of the run at which the policy was saved.
     """
     recorded = json.loads((Path(run) / "config.json").read_text())["args"]
-    # What an older run does not have has its default
+    # Arguments that an older version of the script did not have get their defaults
     run_args = argparse.Namespace(**{**vars(ppo.parse_args([])), **recorded})
     saved = torch.load(Path(run) / ("best.pt" if best else "checkpoint.pt"), weights_only=True)
     env = make_env(run_args, saved.get("normalization"), render_mode)
@@ -78,7 +75,7 @@ def load_policy(run, best=False, beta=None, seed=1, render_mode=None):
     mean, std = ppo.numpy_policy(agent.actor_mean), agent.std().detach()
     if beta is not None:
         if run_args.method == "gsde":
-            raise ValueError("a policy of gSDE has noise of its own, which has no beta")
+            raise ValueError("gSDE has its own noise, which has no beta")
         noise = ColoredNoiseProcess(beta, 1, len(std), run_args.noise_seq_len, seed)
 
     def policy(obs):
@@ -91,7 +88,7 @@ def load_policy(run, best=False, beta=None, seed=1, render_mode=None):
 
 
 def make_env(run_args, normalization, render_mode):
-    """A vector of one environment, as the run's policy knows it. `normalization`: its state."""
+    """A vector of one environment, as in the run; `normalization`: the state to normalize by."""
     if render_mode == "rgb_array":
         environments.prepare_rendering()
     environments.quiet_packages()
