@@ -1,7 +1,8 @@
 """PPO of Stable-Baselines3: the paper's own stack, in today's versions, to compare results with.
 
     pip install -r requirements.txt -r tests/requirements.txt
-    python -m study.sb3 --env-id dm_control/pendulum-swingup-v0 --vanilla --no-bootstrap-timeouts
+    python -m study.sb3 --env-id dm_control/pendulum-swingup-v0 --vanilla --n-envs 1 \
+        --no-bootstrap-timeouts --eval-freq 204800 --eval-episodes 10
 
 The flags are those of ppo_colored_continuous.py, as far as they apply, and so are the files of a
 run but for checkpoint.pt: a run that was stopped starts again. Environments, networks, rollout,

@@ -1,32 +1,22 @@
 """study.benchmark: contenders do a round's work, its time is in its phases, the tables add up."""
 
-import os
-import signal
-import subprocess
+import multiprocessing
 import sys
 import time
+from types import SimpleNamespace
 from unittest import mock
 
 import pandas as pd
 import pytest
 from gymnasium.envs.classic_control.continuous_mountain_car import Continuous_MountainCarEnv
+from stable_baselines3 import PPO
 
 import ppo_colored_continuous as ppo
 from study import benchmark
-from study.benchmark import PHASES, Clock, Size
+from study.benchmark import PHASES, Clock
 
-CAR, PENDULUM = "MountainCarContinuous-v0", "dm_control/pendulum-swingup-v0"
-
-
-@pytest.fixture(autouse=True)
-def restored(monkeypatch):
-    """The script as it was, after a contender has put its timers in. Nothing is compiled."""
-    timed = [(ppo, "evaluate"), (ppo.ColoredNoiseProcess, "sample")]
-    timed += [(ppo.Run, name) for name in ("add_evaluation", "add_update", "save_checkpoint")]
-    for owner, name in timed:
-        monkeypatch.setattr(owner, name, getattr(owner, name))
-    monkeypatch.setattr(ppo, "compiled", lambda function: function)
-    monkeypatch.setattr(ppo, "SummaryWriter", mock.MagicMock())  # its thread outlives a contender
+CAR = "MountainCarContinuous-v0"
+SMALL = "--n-steps 64 --eval-freq 256 --eval-episodes 2"
 
 
 class Pipe:
@@ -43,7 +33,10 @@ class Pipe:
 
 
 def test_clock(monkeypatch):
-    """Time goes to the innermost phase, and none to the wait between rounds."""
+    """Time goes to the innermost phase, per training step; an evaluation is for 10,240 steps.
+
+    The wait between rounds is in no phase.
+    """
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
 
@@ -55,36 +48,42 @@ def test_clock(monkeypatch):
             wait(1000)
             return super().recv()
 
-    clock = Clock(SlowPipe(n=1))
+    clock, args = Clock(SlowPipe(n=1)), ppo.parse_args([])
     wait(100)  # start-up
-    clock.next_round()
+    clock.next_round(args)
     wait(1)
     clock.timed("update", lambda: (wait(2), clock.timed("files", wait)(4), wait(8)))()
     wait(16)
+    clock.timed("evaluation", wait)(32)
     with pytest.raises(SystemExit):
-        clock.next_round()
+        clock.next_round(args)
     assert clock.pipe.reports[0]["rollout"] == 0
-    report = clock.pipe.reports[1]
-    expected = {"rollout": 17, "noise": 0, "update": 10, "files": 4, "evaluation": 0}
-    assert {phase: report[phase] for phase in PHASES} == expected and report["peak MB"] > 50
+    report, per_step = clock.pipe.reports[1], 1e6 / 8192
+    expected = {"rollout": 17, "noise": 0, "update": 10, "files": 4, "evaluation": 32 * 0.8}
+    for phase in PHASES:
+        assert report[phase] == pytest.approx(expected[phase] * per_step)
+    assert report["total us"] == pytest.approx((31 + 32 * 0.8) * per_step)
+    assert report["peak MB"] > 50
 
 
 @pytest.mark.parametrize(
-    "run, phases, steps",
+    "run, flags, phases, steps",
     [
-        (lambda *how: benchmark.run_script(*how, "--no-envpool"), set(PHASES), 256 + 2 * 999),
-        (lambda *how: benchmark.run_script(*how, "--envpool"), set(PHASES), 0),
-        (lambda *how: benchmark.run_script(*how, "--no-envpool", evaluations=False),
-         {"rollout", "noise", "update"}, 256),
-        (benchmark.run_peer, {"rollout", "update", "evaluation"}, 256 + 10 * 999),
+        (benchmark.run_script, "--no-envpool", set(PHASES), 256 + 2 * 999),
+        (benchmark.run_script, "--envpool", set(PHASES), 0),
+        (benchmark.run_sb3, "", {"rollout", "update", "evaluation"}, 256 + 10 * 999),
     ],
-    ids=["script", "envpool", "training", "peer"],
-)  # fmt: skip
-def test_a_round(monkeypatch, run, phases, steps):
+    ids=["script", "envpool", "sb3"],
+)
+def test_a_round(monkeypatch, run, flags, phases, steps):
     """Which phases take time, and how often the car, which never reaches the goal, is stepped.
 
-    The peer steps its 10 environments until the 2 episodes have ended.
+    Stable-Baselines3 steps its 10 environments until the 2 episodes have ended.
     """
+    timed = [(ppo, "evaluate"), (ppo.ColoredNoiseProcess, "sample"), (PPO, "train")]
+    timed += [(ppo.Run, name) for name in ("add_evaluation", "add_update", "save_checkpoint")]
+    for owner, name in timed:  # to be restored at the end
+        monkeypatch.setattr(owner, name, getattr(owner, name))
     taken, step = [0], Continuous_MountainCarEnv.step
 
     def counted(*args):
@@ -96,61 +95,49 @@ def test_a_round(monkeypatch, run, phases, steps):
             taken.append(0)
             return super().recv()
 
+    monkeypatch.setattr(ppo, "compiled", lambda function: function)
+    monkeypatch.setattr(ppo, "SummaryWriter", mock.MagicMock())  # its thread outlives the folder
     monkeypatch.setattr(Continuous_MountainCarEnv, "step", counted)
     pipe = CountingPipe(n=2)
     with pytest.raises(SystemExit):
-        run(Clock(pipe), CAR, Size(n_envs=4, n_steps=64, eval_episodes=2))
+        run(Clock(pipe), f"--env-id {CAR} --n-envs 4 {SMALL} {flags}")
     assert taken == [0, steps, steps, 0]
     for report in pipe.reports[2:]:  # in the first round there is a checkpoint in any case
         assert {phase for phase in PHASES if report[phase] > 0} == phases
 
 
-def killed(clock, env_id, size):
-    os.kill(os.getpid(), signal.SIGKILL)
+def contender(clock, flags):
+    """Plays rounds of 1000 steps, whose updates are said to take 9000, 1000, 4000, 2000 seconds."""
+    args = SimpleNamespace(n_envs=1, n_steps=1000)
+    clock.next_round(args)
+    for seconds in (9000, 1000, 4000, 2000):
+        clock.seconds["update"] = seconds
+        clock.next_round(args)
 
 
-def test_measure(capsys):
-    """Processes of their own, in turns; those that cannot run are named."""
-    size = Size(n_envs=4, n_steps=64, eval_episodes=1)
-    contenders = {"physics": benchmark.run_physics, "killed": killed}
-    (row,) = benchmark.measure(PENDULUM, contenders, 2, size)
-    assert (row["env_id"], row["contender"], row["n_envs"]) == (PENDULUM, "physics", 4)
-    assert row["rollout"] > 0 and row["evaluation"] > 0 and row["update"] == 0
-    assert row["from"] <= row["total us"] <= row["to"] and row["start-up s"] > 0
-    assert not benchmark.measure(CAR, {"physics": benchmark.run_physics}, 1, size)
-    notes = capsys.readouterr().err
-    assert f"nothing of killed on {PENDULUM} (its process has died" in notes
-    assert f"nothing of physics on {CAR} (ValueError: it knows only dm_control's models)" in notes
-
-
-def test_summary():
-    """Medians per training step, with 8,192 / 10,240 of an evaluation."""
-    rounds = [dict.fromkeys(PHASES, 0) | {"peak MB": 7} for _ in range(3)]
-    for seconds, report in zip((0.2, 0.3, 0.4), rounds, strict=True):
-        report |= {"update": seconds, "rollout": seconds / 10, "evaluation": seconds / 10}
-    row, us = benchmark.summary(rounds, Size()), 1e6 / 8192
-    assert row["update"] == pytest.approx(0.3 * us)
-    assert row["evaluation"] == pytest.approx(0.03 * 0.8 * us)
-    assert row["total us"] == pytest.approx((0.3 + 0.03 + 0.03 * 0.8) * us)
-    assert row["from"] == pytest.approx(row["total us"] * 2 / 3) and row["peak MB"] == 7
+def test_measure(monkeypatch):
+    """In processes of their own; medians over all rounds but the first."""
+    fork = multiprocessing.get_context("fork")  # a new Python would import all of the above
+    monkeypatch.setattr(multiprocessing, "get_context", lambda name: fork)
+    rows = benchmark.measure(CAR, 4, 3, {name: (contender, "") for name in ("one", "other")})
+    for row, name in zip(rows, ("one", "other"), strict=True):
+        assert (row["env_id"], row["contender"], row["n_envs"]) == (CAR, name, 4)
+        columns = [row[name] for name in ("update", "total us", "from", "to")]
+        assert columns == pytest.approx([2e6, 2e6, 1e6, 4e6], rel=1e-3)
 
 
 def test_tables(tmp_path, monkeypatch, capsys):
     """All four, of made-up times, in one file and on the terminal."""
+    commands = []
 
-    def measure(env_id, contenders, n_rounds, size):
-        about, names = {"env_id": env_id, "n_envs": size.n_envs}, list(contenders)
-        return [{**about, "contender": c, "total us": 10.0 * (1 + names.index(c))} for c in names]
+    def measure(env_id, n_envs, n_rounds, contenders):
+        about = {"env_id": env_id, "n_envs": n_envs}
+        return [
+            {**about, "contender": c, "total us": 10.0 * i} for i, c in enumerate(contenders, 1)
+        ]
 
-    def seconds(command, variables):  # the script's commands in this process
-        python, *words = command
-        if words[0] == "-c":
-            monkeypatch.setattr(sys, "argv", words[1:])
-            exec(words[1], {})
-        elif "sweep" in python:
-            subprocess.run(command, check=True, cwd=benchmark.ROOT, env=os.environ | variables)
-        else:
-            ppo.main(ppo.parse_args(words[1:]))
+    def seconds(command, variables):
+        commands.append(command)
         return 3.0
 
     monkeypatch.setattr(benchmark, "measure", measure)
@@ -159,18 +146,16 @@ def test_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "CORES", [0, 1])
     benchmark.main(benchmark.parse_args(["--rounds", "1", "--csv", str(tmp_path / "table.csv")]))
     table = pd.read_csv(tmp_path / "table.csv")
-    assert len(table) == 3 * 5 + 5 * 2 + 3 * 2 + 7
-    stack = table[table.contender == benchmark.PAPER]
-    assert (stack["x faster"] == 1).all() and (stack["x physics"] == 3 / 5).all()
+    assert len(table) == 3 * 3 + 5 * 2 + 3 * 2 + 7
+    assert (table[table.contender == "the paper's stack"]["x faster"] == 1).all()
     assert (table[table.contender == "this script"]["x faster"] == 3).all()
-    one_run = table[table.contender == "one run, 2 cores"]
+    one_run = table[table.contender == "one run, --threads 2"]
     assert one_run.minutes.to_numpy() == pytest.approx(10e-6 * 2_048_000 / 60, rel=1e-3)
     assert (table.seconds == 3).sum() == 7
-    shown = capsys.readouterr().out
-    assert "first step, loss edited" in shown and "training, --no-envpool" in shown
+    assert "first step, loss edited" in capsys.readouterr().out
 
-
-def test_a_file_in_no_folder(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        benchmark.parse_args(["--csv", "nosuch/table.csv"])
-    assert stopped.value.code == 2 and "there is no such folder" in capsys.readouterr().err
+    _, _, (python, _, code, *words), eager, *_ = commands  # see `waiting`
+    assert ppo.parse_args(words[1:]).compile and not ppo.parse_args(eager[2:]).compile
+    monkeypatch.setattr(sys, "argv", ["-c", *words, "--no-compile", "--runs-dir", str(tmp_path)])
+    exec(code, {})
+    assert next(tmp_path.rglob("summary.json"))
