@@ -10,8 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import ppo_colored_continuous as ppo
-from study.environments import GAIN_BY_THREADS, ThreadedVectorEnv
-from study.protocol import NAMES
+from study.environments import ThreadedVectorEnv
 
 ROOT = Path(ppo.__file__).parent
 
@@ -45,20 +44,16 @@ class Plain(gym.Env):
 gym.register("Plain-v0", Plain, max_episode_steps=3)
 FLOATS = np.array([0.5, 300.25, -7.125], np.float64)
 BYTES, COUNTS = (gym.spaces.Box(0, 255, (3,), dtype) for dtype in (np.uint8, np.int64))
-DICT = gym.spaces.Dict(b=BYTES, a=COUNTS)
+NESTED = gym.spaces.Tuple([BYTES, gym.spaces.Dict(b=gym.spaces.Discrete(3), a=COUNTS)])
 
 
 @pytest.mark.parametrize(
     "space, observation, expected",
     [
         (BYTES, FLOATS, FLOATS),
-        (DICT, {"b": FLOATS, "a": -FLOATS}, [*FLOATS, *-FLOATS]),
-        (gym.spaces.Tuple([BYTES, DICT]), (FLOATS, {"b": 2 * FLOATS, "a": -FLOATS}),
-         [*FLOATS, *(2 * FLOATS), *-FLOATS]),
-        (gym.spaces.Dict(a=COUNTS, b=gym.spaces.Discrete(3)), {"a": FLOATS, "b": 1},
-         [*FLOATS, 0, 1, 0]),
+        (NESTED, (FLOATS, {"b": 1, "a": -FLOATS}), [*FLOATS, 0, 1, 0, *-FLOATS]),
     ],
-)  # fmt: skip
+)
 def test_observations_are_float32_whatever_the_space_says(
     monkeypatch, space, observation, expected
 ):
@@ -76,64 +71,21 @@ def test_observations_are_float32_whatever_the_space_says(
         np.testing.assert_array_equal(obs, np.float32(expected))
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_rescaled_actions_never_leave_the_bounds(monkeypatch, dtype):
+def test_rescaled_actions_never_leave_the_bounds(monkeypatch):
     rng = np.random.default_rng(0)
     low, high = np.sort(rng.normal(size=(2, 2000)) * 10 ** rng.uniform(-2, 2, 2000), axis=0)
-    space = gym.spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
+    space = gym.spaces.Box(np.float32(low), np.float32(high))
     monkeypatch.setattr(Plain, "action_space", space)
     env = ppo.make_env(parse("--env-id Plain-v0 --rescale-actions --no-envpool"))
-    assert env.action_space == gym.spaces.Box(-1, 1, (2000,), dtype)
+    assert env.action_space == gym.spaces.Box(-1, 1, (2000,))
     for value in (-1, 0, 0.4, 1):
         env.reset(seed=0)
         env.step(np.full(2000, value, np.float32))
-        low, high = (bound.astype(float) for bound in (space.low, space.high))
-        error = env.unwrapped.last_action - (low + (value + 1) / 2 * (high - low))
-        assert (abs(error) <= 1e-3 * (abs(low) + abs(high))).all()
+        expected = space.low + (value + 1) / 2 * (space.high - space.low)
+        np.testing.assert_allclose(env.unwrapped.last_action, expected, rtol=1e-4, atol=1e-4)
     monkeypatch.setattr(Plain, "action_space", gym.spaces.Box(-np.inf, np.inf, (1,)))
     with pytest.raises(ValueError, match="--rescale-actions needs bounds"):
         ppo.make_env(parse("--env-id Plain-v0 --rescale-actions"))
-
-
-class FromSpaces(Plain):
-    """Its observation is a sample of each of its spaces."""
-
-    def __init__(self):
-        self.action_space = gym.spaces.Box(-1, 1, (1,))
-        self.observation_space = gym.spaces.Box(-1, 1, (2,))
-
-    def reset(self, seed=None, options=None):
-        drawn = self.observation_space.sample()[0], self.action_space.sample()[0]
-        return np.array(drawn, np.float32), {}
-
-
-gym.register("FromSpaces-v0", FromSpaces)
-
-
-def test_seeds_reach_the_spaces_of_each_environment():
-    first, again = (make_envs("--env-id FromSpaces-v0", 3).reset(seed=[1, 2, 1])[0] for _ in "ab")
-    np.testing.assert_array_equal(first, again)
-    assert (first[0] == first[2]).all() and (first[0] != first[1]).all()
-
-
-MINE = """
-import gymnasium as gym, numpy as np
-class Mine(gym.Env):
-    observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    def reset(self, seed=None, options=None): return np.zeros(1, np.float32), {}
-    def step(self, action): return np.zeros(1, np.float32), 0.0, True, False, {}
-gym.register("Mine-v0", Mine)
-"""
-
-
-def test_a_users_module_may_have_the_name_of_one_of_ours(tmp_path, monkeypatch):
-    (tmp_path / "mazes.py").write_text(MINE)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    envs = make_envs("--env-id mazes:Mine-v0", 2)
-    monkeypatch.delitem(sys.modules, "mazes")
-    assert type(envs.envs[0].unwrapped).__module__ == "mazes"
-    assert str(tmp_path) not in sys.path[:-2]  # a file there must not hide a package
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "PointUMaze-v1", "dm_control/reacher-hard-v0"])
@@ -163,59 +115,42 @@ def trajectory(envs, n_steps):
     return [(a.shape, a.dtype, a.tobytes()) for a in results]
 
 
-@pytest.mark.parametrize("env_id", ["SwimmerUMaze-v1", "Hopper-v5"])
-@pytest.mark.parametrize("threads", [2, 3, 9])
+@pytest.mark.parametrize("env_id, threads", [("SwimmerUMaze-v1", 9), ("Hopper-v5", 3)])
 def test_threads_change_nothing(env_id, threads, monkeypatch):
     """Hopper falls at another step in each environment; the maze's episodes end together."""
     monkeypatch.setattr("study.environments.GAIN_BY_THREADS", {"SwimmerUMaze-v1", "Hopper-v5"})
     flags = f"--env-id {env_id} --max-episode-steps 40 --threads"
     single, threaded = make_envs(f"{flags} 1", 5), make_envs(f"{flags} {threads}", 5)
     assert isinstance(threaded, ThreadedVectorEnv) and not isinstance(single, ThreadedVectorEnv)
-    for name in ("observation_space", "single_observation_space", "single_action_space"):
-        assert getattr(threaded, name) == getattr(single, name)
-    assert threaded.metadata["autoreset_mode"] == single.metadata["autoreset_mode"]
     assert trajectory(single, 100) == trajectory(threaded, 100)
     threaded.close()
 
 
 def test_threads_step_only_what_is_known_to_share_nothing():
     """An environment of a user may share a file, a simulator or a variable."""
-    assert NAMES.keys() >= GAIN_BY_THREADS
-    for env_id in ("Pendulum-v1", "Hopper-v5", "Plain-v0", "PointUMaze-v1"):
+    for env_id in ("Hopper-v5", "Plain-v0"):
         assert not isinstance(make_envs(f"--env-id {env_id} --threads 2", 4), ThreadedVectorEnv)
-    one = make_envs("--env-id SwimmerUMaze-v1 --threads 2", 1)
-    assert not isinstance(one, ThreadedVectorEnv)
 
 
 # --- Models without what is only seen
 
 
-def assert_same(one, other, n_steps=200):
-    rng = np.random.default_rng(0)
-    assert one.reset(seed=3)[0].tobytes() == other.reset(seed=3)[0].tobytes()
-    for _ in range(n_steps):
-        action = rng.uniform(-1, 1, one.action_space.shape).astype(np.float32)
-        (obs, reward, *_), (other_obs, other_reward, *_) = one.step(action), other.step(action)
-        assert obs.tobytes() == other_obs.tobytes() and reward == other_reward
-
-
-@pytest.mark.parametrize("task", ["cheetah-run", "ball_in_cup-catch", "reacher-hard"])
+@pytest.mark.parametrize("task", ["cheetah-run", "ball_in_cup-catch"])
 def test_models_without_textures_move_the_same(task):
     """Bit for bit, beside dm_control's own, whose textures are whole again afterwards."""
     flags = f"--env-id dm_control/{task}-v0"
     small, whole = make_envs(flags, 1).envs[0], ppo.make_env(parse(flags))
     assert small.unwrapped._env.physics.model.tex_data.nbytes < 1000
     assert whole.unwrapped._env.physics.model.tex_data.nbytes > 10_000_000
-    assert_same(small, whole)
+    rng = np.random.default_rng(0)
+    assert small.reset(seed=3)[0].tobytes() == whole.reset(seed=3)[0].tobytes()
+    for _ in range(200):
+        action = rng.uniform(-1, 1, small.action_space.shape).astype(np.float32)
+        (obs, reward, *_), (other_obs, other_reward, *_) = small.step(action), whole.step(action)
+        assert obs.tobytes() == other_obs.tobytes() and reward == other_reward
 
 
 # --- The door
-
-
-def test_the_door_without_what_is_only_seen_moves_the_same():
-    small, whole = (gym.make("door-v0", render_mode=m).unwrapped for m in (None, "rgb_array"))
-    assert small.model.ntex == small.model.nmesh == 0 < whole.model.ntex
-    assert_same(small, whole)
 
 
 def d4rl_reward(env):
@@ -270,6 +205,7 @@ def test_gymnasium_checks_and_the_limit(door):
 
 
 def python(code, folder):
+    """What this code writes, in a Python of its own."""
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); {code}"
     command = [sys.executable, "-P", "-c", code]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
@@ -284,9 +220,13 @@ def test_importing_is_quick(tmp_path):
 
 # HalfCheetah is first: importing dm_control puts a function of its own in place of ours
 SILENT = """
-import numpy as np, ppo_colored_continuous as ppo
+import argparse, gymnasium as gym, numpy as np
+from study.environments import make_vector_env
 for env_id in ("HalfCheetah-v5", "door-v0", "dm_control/cheetah-run-v0"):
-    envs = ppo.make_vector_env(ppo.parse_args(["--env-id", env_id, "--no-envpool"]), 1)
+    if env_id.startswith("dm_control"):
+        import shimmy
+    args = argparse.Namespace(env_id=env_id, threads=1)
+    envs = make_vector_env(args, 1, lambda args: gym.make(args.env_id, disable_env_checker=True))
     envs.reset(seed=[0])
     if env_id == "HalfCheetah-v5":
         envs.envs[0].unwrapped.data.qvel[:] = 1e20  # MuJoCo warns that it is unstable

