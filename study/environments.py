@@ -1,8 +1,8 @@
 """What the study adds to the environments of ppo_colored_continuous.py.
 
 The paper's own tasks, ten mazes and the Adroit door (importing this file registers their ids);
-EnvPool's C++ versions of ten tasks; and threads that step environments. The package behind an
-environment is imported when one is made.
+EnvPool's C++ versions of ten tasks; and threads that step environments. Packages with environments
+are imported when an environment is made.
 """
 
 import contextlib
@@ -193,7 +193,7 @@ class EnvPoolVectorEnv(VectorEnv):
             )
         import envpool
 
-        gym.logger.min_level = gym.logger.ERROR  # it has notices about its spaces
+        gym.logger.min_level = gym.logger.ERROR  # hides notices about EnvPool's spaces
         self._args, self.num_envs, self._pool = args, n_envs, None
         spec = envpool.make_spec(ENVPOOL_TASKS[args.env_id])
         obs_dim = spaces.flatdim(spec.gymnasium_observation_space)
@@ -208,16 +208,15 @@ class EnvPoolVectorEnv(VectorEnv):
         self._obs_keys = sorted(key for key in self._state_keys if key.split(":")[0] == "obs")
 
     def reset(self, *, seed=None, options=None):
-        """Starts new episodes. Only the first reset needs seeds, n_envs integers below 2^32.
+        """Starts new episodes. Only the first reset uses seeds, n_envs integers below 2^32.
 
-        EnvPool takes its seeds when it is made, which takes seconds; afterwards the environments'
-        generators run on.
+        EnvPool takes seeds only when it makes its environments, and that takes seconds.
         """
         if self._pool is None:
             self._pool = self._make_pool(np.array(seed, np.uint32).view(np.int32))
             self._fresh = np.zeros(self.num_envs, bool)
             self._obs = np.empty(self.observation_space.shape, np.float32)
-        self._begin_episodes(~self._fresh)  # the others have just been reset by step
+        self._begin_episodes(~self._fresh)  # the last step has just reset the others
         return self._obs.copy(), {}
 
     def step(self, actions):

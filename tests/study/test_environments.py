@@ -167,20 +167,9 @@ def door():
     return gym.make("door-v0").unwrapped
 
 
-def test_reward_is_d4rls_at_random_states(door):
-    rng = np.random.default_rng(0)
-    for seed in range(3):
-        door.reset(seed=seed)
-        for _ in range(40):
-            obs, reward, terminated, truncated, _ = door.step(rng.uniform(-1, 1, 28))
-            assert reward == pytest.approx(d4rl_reward(door), rel=1e-12)
-            assert not terminated and not truncated
-            palm, handle = door.data.site("S_grasp").xpos, door.data.site("S_handle").xpos
-            np.testing.assert_array_equal(obs[-4:-1], palm - handle)
-
-
-@pytest.mark.parametrize("hinge, bonus", [(0.1, 0), (0.3, 2), (1.1, 10), (1.5, 20)])
-def test_reward_is_d4rls_at_open_doors(door, hinge, bonus):
+@pytest.mark.parametrize("hinge, bonus", [(0, 0), (0.3, 2), (1.1, 10), (1.5, 20)])
+def test_reward_is_d4rls(door, hinge, bonus):
+    """With the door in this position, in random steps."""
     rng = np.random.default_rng(0)
     for seed in range(3):
         door.reset(seed=seed)
@@ -188,10 +177,13 @@ def test_reward_is_d4rls_at_open_doors(door, hinge, bonus):
         state["qpos"] += 0.02 * rng.standard_normal(30)
         state["qpos"][28:] = hinge, 1.5  # the latch is turned
         door.set_env_state(state)
-        reward, info = door.step(rng.uniform(-1, 1, 28))[1::3]
-        assert reward == pytest.approx(d4rl_reward(door), rel=1e-12)
-        assert bonus - 2 < reward < bonus  # the costs are small beside the bonus
-        assert info["success"] == (bonus == 20)
+        for _ in range(5):
+            obs, reward, terminated, truncated, info = door.step(rng.uniform(-1, 1, 28))
+            assert reward == pytest.approx(d4rl_reward(door), rel=1e-12)
+            assert bonus - 2 < reward < bonus  # the costs are small beside the bonus
+            assert not terminated and not truncated and info["success"] == (bonus == 20)
+            palm, handle = door.data.site("S_grasp").xpos, door.data.site("S_handle").xpos
+            np.testing.assert_array_equal(obs[-4:-1], palm - handle)
 
 
 @pytest.mark.filterwarnings("ignore")  # it recommends bounds
