@@ -172,7 +172,7 @@ ENVPOOL_TASKS = {
 
 def envpool_suits(args):
     """Whether EnvPool is installed and has the task with these arguments. Does not import it."""
-    changed = args.max_episode_steps or args.env_kwargs
+    changed = args.max_episode_steps is not None or args.env_kwargs
     has_task = args.env_id in ENVPOOL_TASKS and not changed
     return has_task and importlib.util.find_spec("envpool") is not None
 
