@@ -290,7 +290,8 @@ def select_methods(runs, method="ppo"):
             lines = (places(part) + part.status).tolist()
         left_out += lines
     if not any(map(len, chosen.values())):
-        raise Unusable("; ".join(["no complete run matches --env, --beta, --n-envs", *left_out[:1]]))
+        what = "no complete run matches --env, --beta, --n-envs"
+        raise Unusable("; ".join([what, *left_out[:1]]))
     return chosen, left_out
 
 
