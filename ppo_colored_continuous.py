@@ -13,7 +13,6 @@ To change the method, edit this file. Start with main(), at its end.
 """
 
 import argparse
-import collections
 import contextlib
 import copy
 import functools
@@ -62,24 +61,24 @@ def parse_args(argv=None, **defaults):
     parser = argparse.ArgumentParser(formatter_class=show_defaults, allow_abbrev=False)
     add = parser.add_argument_group("experiment").add_argument
     add("--env-id", default="MountainCarContinuous-v0", help="or dm_control/NAME-v0, MODULE:NAME")
-    add("--seed", type=int, default=1, help="of everything random")
-    add("--total-timesteps", type=int, default=2_048_000, help="of all environments together")
-    add("--eval-freq", type=int, default=10_240, help="environment steps between evaluations")
+    add("--seed", type=int, default=1, help="seed of all random numbers")
+    add("--total-timesteps", type=int, default=2_048_000, help="steps of all environments together")
+    add("--eval-freq", type=int, default=10_240, help="steps from one evaluation to the next")
     add("--eval-episodes", type=int, default=50, help="episodes per evaluation, in parallel")
-    add("--eval-once-per-policy", action=flag, default=False, help="one evaluation per update")
+    add("--eval-once-per-policy", action=flag, default=False, help="evaluate each policy only once")
     add = parser.add_argument_group("environment").add_argument
     add("--env-kwargs", type=json.loads, help="its keyword arguments, as in '{\"goal\": [3, 0]}'")
-    add("--max-episode-steps", type=int, help="a time limit in place of the environment's own")
+    add("--max-episode-steps", type=int, help="time limit in place of the environment's own")
     add("--rescale-actions", action=flag, default=False, help="map [-1, 1] to the action bounds")
-    add("--normalize-obs", action=flag, default=False, help="by the running mean and std")
-    add("--normalize-rewards", action=flag, default=False, help="by the std of discounted returns")
+    add("--normalize-obs", action=flag, default=False, help="to running mean 0 and std 1")
+    add("--normalize-rewards", action=flag, default=False, help="to std 1 of discounted returns")
     add = parser.add_argument_group("colored noise").add_argument
-    add("--beta", type=beta_or_auto, nargs="+", default=[0.5], help="0 white, 1 pink, 2 red; one "
-        "value, or one per action dimension; auto: from the size of a batch")  # fmt: skip
-    add("--noise-seq-len", type=int, default=1000, help="T, steps until sequences are drawn anew")
-    add("--vanilla", action="store_true", help="white noise from torch, as in ordinary PPO")
+    betas = "0 white, 1 pink, 2 red; one for each action dimension; auto: by the size of a batch"
+    add("--beta", type=beta_or_auto, nargs="+", default=[0.5], help=betas)
+    add("--noise-seq-len", type=int, default=1000, help="T, steps until new sequences are drawn")
+    add("--vanilla", action="store_true", help="white noise of torch.randn, as in ordinary PPO")
     add = parser.add_argument_group("PPO").add_argument
-    add("--n-envs", type=int, default=4, help="parallel environments")
+    add("--n-envs", type=int, default=4, help="number of parallel environments")
     add("--n-steps", type=int, default=2048, help="steps per environment and update")
     add("--batch-size", type=int, default=128, help="steps per minibatch")
     add("--n-epochs", type=int, default=10, help="passes over the data per update")
@@ -91,24 +90,20 @@ def parse_args(argv=None, **defaults):
     add("--normalize-advantage", action=flag, default=True, help="to mean 0, std 1 per minibatch")
     add("--ent-coef", type=float, default=0.0, help="weight of the entropy bonus")
     add("--vf-coef", type=float, default=0.5, help="weight of the value loss")
-    add("--max-grad-norm", type=float, default=0.5, help="the gradient is scaled down to this norm")
+    add("--max-grad-norm", type=float, default=0.5, help="longer gradients are scaled down to it")
     add("--bootstrap-timeouts", action=flag, default=True, help="add gamma * V(obs) at time limits")
-    add = parser.add_argument_group("running").add_argument
-    add("--envpool", action=flag, help="environments in C++; by default where EnvPool has the task")
-    add(
-        "--threads",
-        type=int,
-        default=os.cpu_count(),
-        help="threads that step environments; needs study/",
-    )
-    add("--compile", action=flag, help="compile the loss and its gradients, which takes 10 to 40 "
-        "seconds; by default in runs of 100,000 steps and more")  # fmt: skip
+    running = parser.add_argument_group("running")
+    add = running.add_argument
+    add("--envpool", action=flag, help="tasks in C++; by default where EnvPool has the task")
+    add("--threads", type=int, default=os.cpu_count(), help="threads that step environments")
+    add("--compile", action=flag, help="compile the loss; by default from 100,000 steps on")
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
     add("--exp-name", default="ppo_colored_continuous", help="the experiment, a folder's name")
     add("--runs-dir", default="runs", help="folder of all runs")
+    add("--track", action="store_true", help="log to Weights & Biases too (pip install wandb)")
+    add = running.add_mutually_exclusive_group().add_argument
     add("--resume", action="store_true", help="continue the run from its last checkpoint")
     add("--overwrite", action="store_true", help="start again where the folder holds a run")
-    add("--track", action="store_true", help="log to Weights & Biases too (pip install wandb)")
     parser.set_defaults(**{"method": "ppo", **defaults})  # other methods: study/methods.py
     args = parser.parse_args(argv)
 
@@ -118,8 +113,6 @@ def parse_args(argv=None, **defaults):
     last_evaluation = args.total_timesteps // args.eval_freq * args.eval_freq
     if last_evaluation < args.n_envs * args.n_steps:
         parser.error(f"no update before the last evaluation, at {last_evaluation}: lower --n-steps")
-    if args.resume and args.overwrite:
-        parser.error("--resume continues a run and --overwrite starts it again: choose one")
     if study is None and (args.envpool or args.normalize_obs or args.normalize_rewards):
         parser.error("--envpool and --normalize-* need the folder study/ beside this script")
     if args.envpool is None:
@@ -184,27 +177,24 @@ class Agent(nn.Module):
 def numpy_policy(actor):
     """The module `actor` as a function from numpy to numpy: obs (n, obs_dim) -> (n, action_dim).
 
-    For networks this small numpy is quicker than torch: 6 us for 4 rows, not 31. It is used if all
-    layers are known here; otherwise the module is called, in eval mode. Either way the weights are
-    copied, so call numpy_policy again when the module has learned.
+    For networks this small numpy is quicker than torch: 6 us for 4 rows, not 31. With other layers
+    than those below the module itself is called, in eval mode. Either way the weights are copied,
+    so call numpy_policy again when the module has learned.
     """
-    known = {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
+    known = {nn.Linear: lambda x, weight, bias=0: x @ weight + bias}
+    known |= {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
+    layers = list(actor) if type(actor) is nn.Sequential else [actor]
     # Hooks may change weights or outputs in each call, as spectral_norm's do
     hooks = any(m._forward_hooks or m._forward_pre_hooks for m in actor.modules())
-    functions = []
-    for layer in actor if type(actor) is nn.Sequential and not hooks else [actor]:
-        if type(layer) is nn.Linear and layer.bias is not None and not hooks:
-            weight, bias = (p.detach().cpu().numpy().T.copy() for p in (layer.weight, layer.bias))
-            functions.append(lambda x, weight=weight, bias=bias: x @ weight + bias)
-        elif type(layer) in known:
-            functions.append(known[type(layer)])
-        else:  # one layer is unknown: call the whole module
-            module, device = copy.deepcopy(actor).eval(), next(actor.parameters()).device
-            return lambda obs: module(torch.as_tensor(obs, device=device)).detach().cpu().numpy()
+    if hooks or not all(type(layer) in known for layer in layers):
+        module, device = copy.deepcopy(actor).eval(), next(actor.parameters()).device
+        return lambda obs: module(torch.as_tensor(obs, device=device)).detach().cpu().numpy()
+    functions = [known[type(layer)] for layer in layers]
+    weights = [[p.detach().cpu().numpy().T.copy() for p in m.parameters()] for m in layers]
 
     def policy(x):
-        for function in functions:
-            x = function(x)
+        for function, parameters in zip(functions, weights, strict=True):
+            x = function(x, *parameters)
         return x
 
     return policy
@@ -216,8 +206,8 @@ class FlatEnv(gym.Wrapper):
 
     def __init__(self, env, rescale_actions):
         super().__init__(env)
-        self._space, actions = float32_space(env.observation_space), env.action_space
-        self.observation_space = spaces.Box(-np.inf, np.inf, (spaces.flatdim(self._space),))
+        obs_dim, actions = spaces.flatdim(env.observation_space), env.action_space
+        self.observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,))
         self._low, self._high = actions.low.reshape(-1), actions.high.reshape(-1)
         self._rescale = rescale_actions
         low, high = (-1, 1) if rescale_actions else (self._low, self._high)
@@ -228,7 +218,7 @@ class FlatEnv(gym.Wrapper):
             self.env.action_space.seed(seed)
             self.env.observation_space.seed(seed)
         obs, _ = self.env.reset(seed=seed, options=options)
-        return self._flat(obs), {}
+        return flat(self.env.observation_space, obs), {}
 
     def step(self, action):
         if self._rescale:
@@ -236,20 +226,17 @@ class FlatEnv(gym.Wrapper):
             action = np.clip(action, self._low, self._high)  # rounding may leave them
         action = action.astype(self._low.dtype).reshape(self.env.action_space.shape)
         obs, reward, terminated, truncated, _ = self.env.step(action)
-        return self._flat(obs), reward, terminated, truncated, {}
-
-    def _flat(self, obs):
-        return spaces.flatten(self._space, obs).astype(np.float32)
+        return flat(self.env.observation_space, obs), reward, terminated, truncated, {}
 
 
-def float32_space(space):
-    """The space with float32 in each Box: spaces.flatten casts observations to the space's type."""
-    if isinstance(space, spaces.Dict):
-        pairs = [(key, float32_space(part)) for key, part in space.items()]
-        return spaces.Dict(collections.OrderedDict(pairs))
-    if isinstance(space, spaces.Tuple):
-        return spaces.Tuple([float32_space(part) for part in space])
-    return spaces.Box(-np.inf, np.inf, space.shape) if isinstance(space, spaces.Box) else space
+def flat(space, obs):
+    """One float32 vector. Where spaces.flatten casts to the type of the space, this does not."""
+    if isinstance(space, spaces.Box):
+        return np.asarray(obs, np.float32).flatten()
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        return spaces.flatten(space, obs).astype(np.float32)
+    keys = space if isinstance(space, spaces.Dict) else range(len(space))
+    return np.concatenate([flat(space[key], obs[key]) for key in keys])
 
 
 def make_env(args, render_mode=None):
@@ -263,15 +250,10 @@ def make_env(args, render_mode=None):
 
         if args.max_episode_steps:  # the task's own limit, in seconds, would come first
             kwargs["task_kwargs"] = {"time_limit": math.inf} | kwargs.get("task_kwargs", {})
-    module, _, name = args.env_id.rpartition(":")
-    if module:  # my_env:MyEnv-v0, registered by my_env.py in the current folder, or installed
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())
-        file = importlib.import_module(module).__file__
-        if name not in gym.registry:
-            raise LookupError(f"the module {module}, which is {file}, registers no {name}")
+    if os.getcwd() not in sys.path:  # where my_env.py of my_env:MyEnv-v0 may be
+        sys.path.append(os.getcwd())
     # Gymnasium's checks of the first steps help authors of environments, but take time
-    env = gym.make(name, args.max_episode_steps, disable_env_checker=True, **kwargs)
+    env = gym.make(args.env_id, args.max_episode_steps, disable_env_checker=True, **kwargs)
     actions = env.action_space
     if not isinstance(actions, spaces.Box) or not np.issubdtype(actions.dtype, np.floating):
         raise TypeError(f"{args.env_id} has actions {actions}; colored noise needs real numbers")
@@ -485,22 +467,21 @@ def evaluate(policy, envs, seeds, max_steps=1_000_000):
     raise RuntimeError(f"no end of an episode in {max_steps} steps: set --max-episode-steps")
 
 
-def evaluate_due(run, agent, acting, eval_envs, global_step, args, bar):
+def evaluate_due(run, agent, acting, envs, global_step, args, bar):
     """Makes the evaluations that fall before the next update.
 
     An evaluation at step t is of the policy that acts at step t. With 8,192 steps per update, the
     policy of step 8,192 acts until step 16,383, so it is the one evaluated for step 10,240.
     """
     next_update = global_step + args.n_steps * args.n_envs
-    due = range(run.next_eval, min(next_update, args.total_timesteps + 1), args.eval_freq)
-    policy = numpy_policy(agent.actor_mean) if due else None
-    for step in due:
-        if step == due[0] or not args.eval_once_per_policy:
+    first = max(1, math.ceil(global_step / args.eval_freq)) * args.eval_freq
+    for step in range(first, min(next_update, args.total_timesteps + 1), args.eval_freq):
+        if step == first or not args.eval_once_per_policy:
             seeds = make_seeds(args.eval_episodes, args.seed, 2, step)
-            returns, lengths = evaluate(policy, eval_envs, seeds)
+            returns, lengths = evaluate(numpy_policy(agent.actor_mean), envs, seeds)
         run.add_evaluation(step, returns, lengths, acting)
         bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
-        seed_global_generators(args.seed, 3, global_step)  # whatever evaluations have drawn
+        seed_global_generators(args.seed, 3, global_step)  # evaluations may have drawn from them
 
 
 # --- The run's folder
@@ -524,32 +505,28 @@ def lock(path):
         raise OSError(f"cannot lock {path}: choose a --runs-dir that has locks") from error
 
 
-def replace_file(path, write):
-    """write(path) writes to a temporary file, which is then renamed: it is never half written."""
+def write_file(path, content):
+    """Writes a text, or an object by torch.save, under another name first: never half a file."""
     temporary = path.with_name(path.name + ".tmp")
-    write(temporary)
+    if isinstance(content, str):
+        temporary.write_text(content)
+    else:
+        torch.save(content, temporary)
     os.replace(temporary, path)
-
-
-def write_json(path, value):
-    replace_file(path, lambda file: file.write_text(json.dumps(value, indent=2) + "\n"))
 
 
 def git_commit():
     """Commit of this file, with "-dirty" where the checkout differs from it; None without git."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        how = {"cwd": Path(__file__).parent, "stderr": subprocess.DEVNULL, "text": True}
-        return subprocess.check_output(command, **how).strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
+    command = "git describe --always --dirty --abbrev=40 --exclude='*'"
+    how = {"shell": True, "cwd": Path(__file__).parent, "capture_output": True, "text": True}
+    return subprocess.run(command, **how).stdout.strip() or None
 
 
 class Run:
     """The folder of a run: what it leaves behind, and what --resume continues from.
 
     Attributes: `complete`, whether there is nothing to do; `checkpoint`, a dict to continue from,
-    or None; `next_eval`, the step of the next evaluation. Nothing is changed before start().
+    or None. Nothing is changed before start().
     """
 
     # These do not change the result: they may differ between a run and its --resume
@@ -557,52 +534,45 @@ class Run:
 
     def __init__(self, args):
         self.args, self.path, self.checkpoint = args, run_path(args), None
-        self.next_eval, self.best_return = args.eval_freq, -math.inf
-        self.start_time, self.saved_time, self.logged_step = time.time(), 0.0, 0
-        self.complete = (self.path / "summary.json").exists() and not args.overwrite
-        has_checkpoint = (self.path / "checkpoint.pt").exists() and not args.overwrite
-        if self.complete or has_checkpoint:
-            old = json.loads((self.path / "config.json").read_text())["args"]
-            for name, value in vars(args).items():
-                if old.get(name) != value and name not in self.FREE_ARGUMENTS:
-                    raise FileExistsError(f"{self.path} holds a run with {name} {old.get(name)}, "
-                        f"not {value}: choose another --exp-name, or --overwrite")  # fmt: skip
-        if has_checkpoint and not self.complete:
-            if not args.resume:
-                raise FileExistsError(f"{self.path} is unfinished: use --resume or --overwrite")
-            file = self.path / "checkpoint.pt"
-            self.checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+        self.start_time, self.saved_time, self.best_return = time.time(), 0.0, -math.inf
+        summary, checkpoint = self.path / "summary.json", self.path / "checkpoint.pt"
+        self.complete = summary.exists() and not args.overwrite
+        if args.overwrite or not (summary.exists() or checkpoint.exists()):
+            return
+        old = json.loads((self.path / "config.json").read_text())["args"]
+        for name, value in vars(args).items():
+            if old.get(name) != value and name not in self.FREE_ARGUMENTS:
+                found = f"{self.path} holds a run with {name} {old.get(name)}, not {value}"
+                raise FileExistsError(f"{found}: choose another --exp-name, or --overwrite")
+        if self.complete:
+            return
+        if not args.resume:
+            raise FileExistsError(f"{self.path} is unfinished: use --resume or --overwrite")
+        self.checkpoint = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        self.best_return = self.checkpoint["best_return"]
+        self.start_time -= self.checkpoint["wall_seconds"]  # so wall_seconds continues
 
-    def start(self):
-        """Cuts the files back to the checkpoint, or clears the folder; opens TensorBoard's file."""
-        stale = ["*.tmp"]  # left by a process that was killed while writing
-        if not self.checkpoint:
-            stale += ["summary.json", "checkpoint.pt", "best.pt", "events.out.tfevents.*"]
-        for pattern in stale:
-            for file in self.path.glob(pattern):
-                file.unlink()
-        if self.checkpoint:
-            self.logged_step = self.checkpoint["global_step"]
-            self.next_eval = self.checkpoint["next_eval"]
-            self.best_return = self.checkpoint["best_return"]
-            self.start_time -= self.checkpoint["wall_seconds"]  # so wall_seconds continues
-            rows = (self.path / "evaluations.csv").read_text().splitlines(keepends=True)
-            rows = rows[
-                : self.next_eval // self.args.eval_freq
-            ]  # the header, and a row per earlier evaluation
+    def start(self, global_step=0):
+        """Clears the folder, or cuts its files back to global_step, that of the checkpoint."""
+        table, rows = self.path / "evaluations.csv", ["step,return_mean,return_std,length_mean\n"]
+        if global_step:
+            # The header, and a row for each earlier evaluation
+            n_rows = math.ceil(global_step / self.args.eval_freq)
+            rows = table.read_text().splitlines(keepends=True)[:n_rows]
         else:
-            rows = ["step,return_mean,return_std,length_mean\n"]
+            for name in ("summary.json", "checkpoint.pt", "best.pt", "events.out.tfevents.*"):
+                for file in self.path.glob(name):
+                    file.unlink()
             versions = {x.name: x.version for x in importlib.metadata.distributions()}
             config = {"args": vars(self.args), "git_commit": git_commit(), "versions": versions}
-            write_json(self.path / "config.json", config)
-        replace_file(self.path / "evaluations.csv", lambda file: file.write_text("".join(rows)))
+            write_file(self.path / "config.json", json.dumps(config, indent=2) + "\n")
+        write_file(table, "".join(rows))
         if self.args.track:
             import wandb
 
             wandb.init(project="ppo_colored_noise", name=str(self.path), sync_tensorboard=True)
         # TensorBoard hides what an earlier process has logged from purge_step on
-        self.writer = SummaryWriter(str(self.path), purge_step=self.logged_step or None)
-        self.log_time = time.time()
+        self.writer = SummaryWriter(str(self.path), purge_step=global_step or None)
 
     def add_evaluation(self, step, returns, lengths, acting):
         """Writes a row of evaluations.csv; and best.pt, what acted, if no return was better."""
@@ -615,31 +585,28 @@ class Run:
             self.best_return = mean.item()
             best = {name: part.state_dict() for name, part in acting.items()}
             best |= {"step": step, "return_mean": self.best_return}
-            replace_file(self.path / "best.pt", lambda file: torch.save(best, file))
+            write_file(self.path / "best.pt", best)
         for name, value in ("return_mean", mean), ("return_std", std), ("length_mean", length):
             self.writer.add_scalar(f"evaluation/{name}", value, step)
-        self.next_eval = step + self.args.eval_freq
 
     def add_update(self, step, losses, episodes):
         """Logs an update: its losses, the speed, and the (return, length) means of episodes."""
         scalars = {f"losses/{name}": float(value) for name, value in losses.items()}
+        scalars["time/steps_per_second"] = step / (time.time() - self.start_time)
         if episodes:
             means = np.mean(episodes, axis=0)
             scalars |= {"rollout/return_mean": means[0], "rollout/length_mean": means[1]}
-        seconds = time.time() - self.log_time
-        scalars["time/steps_per_second"] = (step - self.logged_step) / seconds
         for tag, value in scalars.items():
             self.writer.add_scalar(tag, value, step)
-        self.logged_step, self.log_time = step, time.time()
 
-    def save_checkpoint(self, parts, global_step, torch_rng):
+    def save_checkpoint(self, parts, global_step):
         """Writes checkpoint.pt, all that --resume needs. parts: objects that have a state_dict."""
         self.writer.flush()
         state = {name: part.state_dict() for name, part in parts.items()}
-        state |= {"global_step": global_step, "torch_rng": torch_rng}
-        state |= {"next_eval": self.next_eval, "best_return": self.best_return}
+        state |= {"global_step": global_step, "torch_rng": torch.get_rng_state()}
+        state["best_return"] = self.best_return
         state["wall_seconds"] = time.time() - self.start_time
-        replace_file(self.path / "checkpoint.pt", lambda file: torch.save(state, file))
+        write_file(self.path / "checkpoint.pt", state)
         self.saved_time = time.time()
 
     def finish(self, steps):
@@ -647,11 +614,12 @@ class Run:
         self.writer.close()
         rows = (self.path / "evaluations.csv").read_text().splitlines()[1:]
         returns = [float(row.split(",")[1]) for row in rows]
-        summary = {"performance": sum(returns) / len(returns), "final_return": returns[-1]}
-        summary |= {"steps": steps, "wall_seconds": round(time.time() - self.start_time, 1)}
-        write_json(self.path / "summary.json", summary)
-        print(f"performance {summary['performance']:.4g}, final return {returns[-1]:.4g}, "
-              f"{summary['wall_seconds'] / 60:.1f} min: {self.path}")  # fmt: skip
+        performance, seconds = sum(returns) / len(returns), time.time() - self.start_time
+        summary = {"performance": performance, "final_return": returns[-1], "steps": steps}
+        summary["wall_seconds"] = round(seconds, 1)
+        write_file(self.path / "summary.json", json.dumps(summary, indent=2) + "\n")
+        results = f"performance {performance:.4g}, final return {returns[-1]:.4g}"
+        print(f"{results}, {seconds / 60:.1f} min: {self.path}")
 
 
 # --- The whole run
@@ -673,8 +641,9 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
     torch.set_num_threads(1)
     seed_global_generators(args.seed, 3, 0)  # before environments are made: some draw then
     envs, eval_envs = make_vector_env(args, args.n_envs), make_vector_env(args, args.eval_episodes)
+    acting = {}  # all that acts, for best.pt
     if args.normalize_obs or args.normalize_rewards:
-        envs = study.NormalizedVectorEnv(envs, args)
+        envs = acting["normalization"] = study.NormalizedVectorEnv(envs, args)
         eval_envs = envs.frozen(eval_envs)
     with contextlib.closing(envs), contextlib.closing(eval_envs), lock(run_path(args)):
         run = Run(args)
@@ -692,9 +661,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         gradients = functools.partial(loss_gradients, loss)
         gradients = compiled(gradients) if args.compile else gradients
 
-        acting = {"agent": agent}  # for best.pt
-        if hasattr(envs, "state_dict"):
-            acting["normalization"] = envs  # the statistics of --normalize-obs and -rewards
+        acting["agent"] = agent
         saved = {**acting, "optimizer": optimizer, "noise": noise}  # for checkpoint.pt
         global_step = 0
         if run.checkpoint:
@@ -704,18 +671,18 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
             run.checkpoint["optimizer"]["param_groups"] = groups
             for name, part in saved.items():
                 part.load_state_dict(run.checkpoint[name])
-        run.start()
+        run.start(global_step)
         # The state of environments cannot be saved: after a resume they begin new episodes
         seed_global_generators(args.seed, 3, global_step)
         obs, _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
         steps_per_update = args.n_steps * args.n_envs
         total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
+        log_every = math.ceil(total / steps_per_update / 1000)  # updates: 1000 points at most
         episodes, so_far = [], np.zeros((2, args.n_envs))
 
-        where = "EnvPool's: make_env() is not called" if args.envpool else "from make_env()"
-        print(f"{run.path}: environments are {where}. After Ctrl-C, --resume continues")
-        bar = tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True,
-                   mininterval=0.5 if sys.stderr.isatty() else 60)  # fmt: skip
+        made_by = "EnvPool: make_env() is not called" if args.envpool else "make_env()"
+        print(f"{run.path}: environments are made by {made_by}. After Ctrl-C, --resume continues")
+        bar = tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True)
         while True:
             evaluate_due(run, agent, acting, eval_envs, global_step, args, bar)
             if global_step == total:
@@ -731,9 +698,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
                 raise FloatingPointError("training diverged: lower --learning-rate")
 
             episodes += ended
-            if (
-                global_step - run.logged_step
-            ) * 1000 >= args.total_timesteps:  # 1000 points or less
+            if global_step // steps_per_update % log_every == 0:
                 *_, returns, values = batch
                 unexplained = (returns - values).var() / returns.var().clamp(min=1e-12)
                 losses |= {"explained_variance": 1 - unexplained, "std": agent.std().mean().item()}
@@ -741,7 +706,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
                 run.add_update(global_step, losses, episodes)
                 episodes = []
             if time.time() > run.saved_time + 5 or global_step == total:
-                run.save_checkpoint(saved, global_step, torch_rng=torch.get_rng_state())
+                run.save_checkpoint(saved, global_step)
         bar.close()
         run.finish(global_step)
 

@@ -101,7 +101,7 @@ main() {
   local python=${PYTHON:-python} scripts sweep go_on
   local mode preset runs_dir jobs retry_failed sbatch runs_per_task folders commands
   scripts=$(dirname "$(realpath "$0")")
-  export PYTHONPATH=$scripts${PYTHONPATH:+:$PYTHONPATH}
+  export PYTHONPATH=$scripts${PYTHONPATH:+:$PYTHONPATH} TQDM_MININTERVAL=60 # for short logs
   sweep=$(PYTHONSAFEPATH=1 "$python" -m study.sweep "$@") || exit # no study in the current folder
   [[ $sweep == mode=* ]] || { printf '%s\n' "$sweep"; exit; }
   eval "$sweep"
