@@ -3,7 +3,6 @@
 import csv
 import importlib.util
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -39,18 +38,6 @@ def train(tmp_path):
         return ppo.run_path(args)
 
     return run
-
-
-@pytest.fixture
-def start(tmp_path):
-    """start("--beta 0", ...) starts the script as a program of its own; returns the process."""
-
-    def start_process(flags="", script=SCRIPT, **kwargs):
-        command = [sys.executable, script, *flags.split(), "--runs-dir", str(tmp_path / "runs")]
-        how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        return subprocess.Popen(command, **how, **kwargs)
-
-    return start_process
 
 
 @pytest.fixture

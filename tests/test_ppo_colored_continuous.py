@@ -3,9 +3,11 @@
 import errno
 import fcntl
 import json
+import multiprocessing
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -186,14 +188,14 @@ def test_loss_and_gradient(flags, settings):
 
 @pytest.mark.parametrize("compile", [False, True])
 def test_parameters_after_steps_of_adam(compile, capsys):
-    """Five steps at falling rates, eager and compiled, the last of a smaller minibatch."""
+    """At falling rates, eager and compiled; eager, the last of a smaller minibatch."""
     agent, sb3, args = make_pair()
     optimizer = ppo.make_optimizer(agent, args)
     gradients = ppo.functools.partial(ppo.loss_gradients, ppo.ppo_loss)
     gradients = ppo.compiled(gradients) if compile else gradients
     minibatch, before = random_minibatch(agent), parameters(agent)
     args.n_epochs, args.batch_size = 1, N_STEPS * N_ENVS
-    for rate, n in [(1e-3, 192), (8e-4, 192), (5e-4, 192), (2e-4, 192), (1e-4, 96)]:
+    for rate, n in [(1e-3, 192), (8e-4, 192), (5e-4, 192), (2e-4, 192 if compile else 96)]:
         part = tuple(x[:n] for x in minibatch)
         fill_buffer(sb3, part)
         sb3.rollout_buffer.buffer_size, sb3.rollout_buffer.n_envs = n, 1
@@ -326,24 +328,10 @@ def test_autoreset_inserts_no_dummy_transition(env_id, beside, monkeypatch):
 
 
 def test_evaluation_counts_whole_episodes_once():
-    envs = ppo.make_vector_env(parse("--env-id CountTruncated-v0"), 3)
-    returns, lengths = ppo.evaluate(lambda obs: np.zeros((3, 1), np.float32), envs, [3, 10, 1])
-    assert returns.tolist() == [6, 15, 1] and lengths.tolist() == [3, 5, 1]
-
-
-def test_the_time_limit_of_an_environment_holds_however_long():
-    envs = ppo.make_vector_env(parse("--env-id CountTerminated-v0"), 1)
-    _, lengths = ppo.evaluate(lambda obs: np.zeros((1, 1), np.float32), envs, [20_000])
-    assert lengths == [20_000]
-
-
-def test_dict_observations_are_flattened_to_float32_in_order():
-    envs = ppo.make_vector_env(parse("--env-id dm_control/walker-run-v0 --no-envpool"), 1)
-    obs, _ = envs.reset(seed=[3])
-    raw = envs.envs[0].unwrapped._env.task.get_observation(envs.envs[0].unwrapped._env.physics)
-    expected = np.concatenate([np.ravel(raw[key]) for key in sorted(raw)])
-    assert obs.shape == (1, 24) and obs.dtype == np.float32
-    np.testing.assert_allclose(obs[0], expected, rtol=1e-6)
+    """However long they are."""
+    envs = ppo.make_vector_env(parse("--env-id CountTerminated-v0"), 3)
+    returns, lengths = ppo.evaluate(lambda obs: np.zeros((3, 1), np.float32), envs, [3, 20_000, 1])
+    assert returns.tolist() == [6, 20_000 * 20_001 / 2, 1] and lengths.tolist() == [3, 20_000, 1]
 
 
 class Draws(gym.Env):
@@ -405,7 +393,9 @@ def test_mountain_car_needs_colored_noise(train, beta, reached):
 
 
 def test_files_of_a_run(train, tiny, tmp_path, read_evaluations, read_events, capsys):
-    folder = train(f"{tiny} --beta 0.25 --seed 3 --exp-name test")
+    """A finished run is not run again, but with --overwrite."""
+    flags = f"{tiny} --beta 0.25 --seed 3 --exp-name test"
+    folder = train(flags)
     path = "runs/test/MountainCarContinuous-v0/beta_0.25/n_envs_2/seed_3"
     assert folder == tmp_path / path
     assert_complete_tiny_run(folder, read_evaluations, read_events)
@@ -421,6 +411,14 @@ def test_files_of_a_run(train, tiny, tmp_path, read_evaluations, read_events, ca
     assert returns[best["step"]] == pytest.approx(best["return_mean"])
     assert str(folder) in capsys.readouterr().out
 
+    before = {file: file.stat().st_mtime_ns for file in folder.iterdir() if file.name != "lock"}
+    train(f"{flags} --resume")
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+    assert capsys.readouterr().out.startswith("nothing was run")
+    train(f"{flags} --overwrite --gamma 0.9")
+    assert read_evaluations(folder) != rows
+    assert_complete_tiny_run(folder, read_evaluations, read_events)
+
 
 def test_evaluations_fall_on_their_steps_whatever_the_update_size(
     train, read_evaluations, read_events
@@ -433,49 +431,44 @@ def test_evaluations_fall_on_their_steps_whatever_the_update_size(
     assert [step for step, _ in losses] == [1500, 3000, 4500, 6000]
 
 
-@pytest.mark.parametrize("beta", ["0.5", "0.5 1 0 0.2 -1 2"])
-def test_dm_control_and_one_beta_per_action_dimension(train, read_evaluations, beta):
-    flags = "--total-timesteps 512 --n-steps 256 --n-envs 1 --eval-freq 256 --eval-episodes 1 "
-    flags += f"--n-epochs 1 --no-compile --no-envpool --beta {beta}"
+def test_dm_control_and_one_beta_per_action_dimension(train, read_evaluations):
+    flags = "--total-timesteps 512 --n-steps 256 --n-envs 1 --eval-freq 512 --eval-episodes 1 "
+    flags += "--n-epochs 1 --no-compile --no-envpool --beta 0.5 1 0 0.2 -1 2"
     folder = train(f"--env-id dm_control/cheetah-run-v0 {flags}")
-    assert [row["length_mean"] for row in read_evaluations(folder)] == [1000, 1000]
-    assert folder.parts[-3] == "beta_" + beta.replace(" ", "_")
+    assert [row["length_mean"] for row in read_evaluations(folder)] == [1000]
+    assert folder.parts[-3] == "beta_0.5_1_0_0.2_-1_2"
 
 
-def test_beta_auto(train, tiny):
-    folder = train(f"{tiny} --beta auto")
-    beta = json.loads((folder / "config.json").read_text())["args"]["beta"]
-    assert folder.parts[-3] == "beta_auto" and beta == [projected_beta(2, 256, 1000)]
+def test_beta_auto():
+    args = parse("--beta auto --n-envs 2 --n-steps 256")
+    assert args.beta == [projected_beta(2, 256, 1000)]
+    assert ppo.run_path(args).parts[-3] == "beta_auto"
 
 
-def wait_for_rows(folder, n, process):
-    """Waits until a run has made n evaluations."""
-    table = folder / "evaluations.csv"
-    while process.poll() is None and not (table.exists() and table.read_text().count("\n") > n):
-        time.sleep(0.01)
-
-
-def test_kill_at_any_moment_and_resume(start, train, tiny, read_evaluations, read_events):
+def test_kill_at_any_moment_and_resume(train, tiny, tmp_path, read_evaluations, read_events):
     """In the end everything is there once, and the noise went on where it was."""
-    rng, flags = random.Random(1), f"{tiny} --env-id Pendulum-v1 --resume"
-    args = parse(flags)
-    reached = 0
-    for kill_at in (2, 5):
-        process = start(flags)
-        args.runs_dir = process.args[-1]
-        folder = ppo.run_path(args)
-        wait_for_rows(folder, kill_at, process)
-        time.sleep(rng.random() * 0.2)
+    flags = f"{tiny} --env-id Pendulum-v1 --resume"
+    args = parse(f"{flags} --runs-dir {tmp_path}/runs")
+    folder, reached = ppo.run_path(args), 0
+    table, checkpoint = folder / "evaluations.csv", folder / "checkpoint.pt"
+    for kill_at in (2, 4, 6):
+        process = multiprocessing.get_context("fork").Process(target=ppo.main, args=(args,))
+        process.start()
+        while process.is_alive() and not (
+            table.exists() and table.read_text().count("\n") > kill_at
+        ):
+            time.sleep(0.003 * kill_at)
         process.kill()
-        process.communicate()
-        checkpoint = folder / "checkpoint.pt"
+        process.join()
         if checkpoint.exists():
             step = torch.load(checkpoint, weights_only=True)["global_step"]
             assert step >= reached
             reached = step
+        time.sleep(1)  # TensorBoard sorts its files by the second in which they were made
+    assert process.exitcode == -signal.SIGKILL
     assert train(flags) == folder
-    assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=2)
-    final = torch.load(folder / "checkpoint.pt", weights_only=True)
+    assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=3)
+    final = torch.load(checkpoint, weights_only=True)
     # steps of Adam: 8 updates of 512 / 128 minibatches; noise: 8 x 256 steps of sequences of 1000
     assert final["optimizer"]["state"][0]["step"].item() == 8 * 4
     assert final["noise"]["index"] == 8 * 256 - 2 * 1000
@@ -521,37 +514,15 @@ def test_resume_goes_on_from_the_checkpoint(train, tiny, tmp_path, read_evaluati
     assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=1)
 
 
-def test_a_finished_run_is_not_run_again(train, tiny, capsys):
-    folder = train(tiny)
-    before = {path: path.stat().st_mtime_ns for path in folder.iterdir() if path.name != "lock"}
-    capsys.readouterr()
-    assert train(f"{tiny} --resume") == folder
-    assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert capsys.readouterr().out.startswith("nothing was run")
-
-
-def test_overwrite_starts_again(train, tiny, read_evaluations, read_events):
-    folder = train(f"{tiny} --seed 2")
-    first = (folder / "evaluations.csv").read_text()
-    assert train(f"{tiny} --seed 2 --overwrite --gamma 0.9") == folder
-    assert (folder / "evaluations.csv").read_text() != first
-    assert_complete_tiny_run(folder, read_evaluations, read_events)
-
-
-def test_a_second_process_is_kept_out_and_the_lock_goes_with_the_run(start, train, tiny):
-    args = parse(tiny)
-    process = start(tiny)
-    args.runs_dir = process.args[-1]
-    process.kill()
-    process.communicate()
-    path = ppo.run_path(args)
-    path.mkdir(parents=True, exist_ok=True)
+def test_a_second_process_is_kept_out_and_the_lock_goes_with_the_run(train, tiny, tmp_path):
+    path = ppo.run_path(parse(f"{tiny} --runs-dir {tmp_path}/runs"))
+    path.mkdir(parents=True)
     with filelock.FileLock(path / "lock"), pytest.raises(SystemExit) as ended:
         train(tiny)
     assert ended.value.code == 3
     with pytest.raises(KeyboardInterrupt):  # in a notebook, say
         train(tiny, learn=interrupt)
-    assert train(f"{tiny} --overwrite") == path
+    assert train(f"{tiny} --total-timesteps 512") == path
 
 
 def test_without_flock_there_is_no_lock_by_existence(train, tiny, tmp_path, monkeypatch):
@@ -575,7 +546,7 @@ def interrupt(*_):
         ("--n-envs 0", "must be positive"),
         ("--n-envs many", "invalid int value"),
         ("--beta 0.5 auto", "auto is one value"),
-        ("--resume --overwrite", "choose one"),
+        ("--resume --overwrite", "not allowed with"),
         ("--n-envs 64 --total-timesteps 100000", "no update before the last evaluation"),
         ("--env-kwargs goal=3", "env-kwargs"),
     ],
@@ -618,11 +589,6 @@ def test_a_diverged_run_says_so(train, tiny):
         train(f"{tiny} --learning-rate 1e30")
 
 
-def test_a_module_that_registers_another_is_named_by_its_file(train, tiny):
-    with pytest.raises(LookupError, match=r"tqdm.__init__.py, registers no MyEnv-v0"):
-        train(f"{tiny} --env-id tqdm:MyEnv-v0")
-
-
 def test_discrete_actions_are_refused(train, tiny):
     with pytest.raises(TypeError, match="CartPole-v1 has actions Discrete"):
         train(f"{tiny} --env-id CartPole-v1")
@@ -645,40 +611,39 @@ gym.register("MyEnv-v0", MyEnv, max_episode_steps=7)
 """
 
 
-def test_two_files_alone(tmp_path, tiny, read_evaluations):
-    """In an empty folder: Gymnasium's, dm_control's and one's own tasks; kill and --resume."""
+def test_two_files_alone(tmp_path, read_evaluations):
+    """In an empty folder: Gymnasium's, dm_control's and one's own tasks; and --resume."""
     for name in ("ppo_colored_continuous.py", "colored_noise.py"):
         shutil.copy(ppo.Path(SCRIPT).with_name(name), tmp_path)
     (tmp_path / "my_env.py").write_text(MODULE)
-    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    how = {"cwd": tmp_path, "env": env, "capture_output": True, "text": True}
-
-    code = f"""
+    code = """
 import ppo_colored_continuous as ppo
 assert ppo.study is None
+tiny = "--total-timesteps 512 --n-envs 2 --n-steps 128 --eval-freq 256 --eval-episodes 1 "
+tiny += "--no-compile --env-id "
 for env_id in ("Pendulum-v1", "dm_control/pendulum-swingup-v0", "my_env:MyEnv-v0"):
-    args = ppo.parse_args(["--env-id", env_id, *{tiny.split()}, "--eval-episodes", "1"])
+    args = ppo.parse_args((tiny + env_id).split())
     ppo.main(args)
 folder = ppo.run_path(args)
 (folder / "summary.json").unlink()
 args.resume = True
 ppo.main(args)
 assert (folder / "summary.json").exists()
-for flags in (["--normalize-obs"], ["--envpool"]):
+for flag in ("--normalize-obs", "--envpool"):
     try:
-        ppo.parse_args(flags)
+        ppo.parse_args([flag])
     except SystemExit as error:
         assert error.code == 2
     else:
-        raise AssertionError(flags)
+        raise AssertionError(flag)
+ppo.main(ppo.parse_args(["--env-id", "PointUMaze-v1"]))
 """
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    how = {"cwd": tmp_path, "env": env, "capture_output": True, "text": True}
     done = subprocess.run([sys.executable, "-c", code], **how)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1 and "PointUMaze" in done.stderr.splitlines()[-1], done.stderr
     tables = list(tmp_path.rglob("evaluations.csv"))
-    assert len(tables) == 3 and all(len(read_evaluations(table.parent)) == 8 for table in tables)
-    command = [sys.executable, "ppo_colored_continuous.py", "--env-id", "PointUMaze-v1"]
-    done = subprocess.run(command, **how)
-    assert done.returncode == 1 and "PointUMaze" in done.stderr.splitlines()[-1]
+    assert len(tables) == 3 and all(len(read_evaluations(table.parent)) == 2 for table in tables)
 
 
 # --- Edits that students make, each in a copy of the script: they take effect, or fail loudly
@@ -733,17 +698,13 @@ LOG_STD = "self.log_std = nn.Parameter(torch.zeros(action_dim))"
 
 
 def test_frozen_and_shared_parameters(run_edited):
-    frozen = LOG_STD[:-1] + ", requires_grad=False)"
-    agent, scalars, _ = run_edited((LOG_STD, frozen), flags="--compile")
+    """Compiled as well as eager."""
+    edit = LOG_STD[:-1] + ", requires_grad=False)\n        self.critic[0] = self.actor_mean[0]"
+    agent, scalars, _ = run_edited((LOG_STD, edit), flags="--compile")
+    eager, *_ = run_edited((LOG_STD, edit))
     assert scalars["losses/std"] == [1.0] * 4 and agent.log_std.item() == 0
-    trunk = f"{LOG_STD}\n        self.critic[0] = self.actor_mean[0]"
-    agent, scalars, _ = run_edited((LOG_STD, trunk), flags="--compile")
-    assert (
-        agent.critic[0] is agent.actor_mean[0] and np.isfinite(scalars["losses/value_loss"]).all()
-    )
-    tied = f"{LOG_STD}\n        self.critic[0].weight = self.actor_mean[0].weight"
-    agent, *_ = run_edited((LOG_STD, tied), flags="--compile")
-    assert agent.critic[0].weight is agent.actor_mean[0].weight
+    assert agent.critic[0] is agent.actor_mean[0]
+    torch.testing.assert_close(parameters(agent), parameters(eager), rtol=1e-3, atol=1e-3)
 
 
 def test_another_optimizer(run_edited):
