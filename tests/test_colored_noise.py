@@ -5,7 +5,6 @@ import colorednoise
 import numpy as np
 import pytest
 import torch
-from scipy import stats
 
 from colored_noise import (
     PUBLISHED_BEST_BETA,
@@ -29,10 +28,9 @@ def draw(beta, n, T, seed=0):
 
 @pytest.mark.parametrize("beta", BETAS)
 def test_psd_falls_as_f_to_the_minus_beta(beta):
-    psd = torch.fft.rfft(draw(beta, 2000, 1000)).abs().square().mean(0).numpy()
-    f = np.fft.rfftfreq(1000)
-    slope = np.polyfit(np.log(f[1:-1]), np.log(psd[1:-1]), 1)[0]
-    assert slope == pytest.approx(-beta, abs=0.02)
+    f, psd = np.fft.rfftfreq(1000)[1:], expected_psd(beta, 1000).numpy()
+    np.testing.assert_allclose(psd[1:] / psd[1], (f / f[0]) ** -beta)
+    assert psd[0] == psd[1]
 
 
 @pytest.mark.parametrize("T", [2, 3, 100, 101])
@@ -61,24 +59,6 @@ def test_closed_forms_have_the_published_values():
     assert expected_psd(torch.tensor([0.0, 1.0]), 10).shape == (2, 6)
 
 
-@pytest.mark.parametrize("T", [100, 101])
-@pytest.mark.parametrize("beta", [0, 0.5, 2])
-def test_agrees_with_the_colorednoise_package_in_distribution(beta, T):
-    n = 20_000
-    theirs = colorednoise.powerlaw_psd_gaussian(beta, (n, T), random_state=1)
-    ours = draw(beta, n, T).numpy()
-    # single values, steps, and sequence means: marginal, two-step correlation and the DC bin
-    for feature in (
-        lambda x: x[:, 3],
-        lambda x: x[:, 4] - x[:, 3],
-        lambda x: x.mean(1),
-        lambda x: x[:, 3] + x[:, 50],
-    ):
-        assert stats.ks_2samp(feature(ours), feature(theirs)).pvalue > 1e-3
-    ours_psd, theirs_psd = (np.mean(np.abs(np.fft.rfft(x)) ** 2, axis=0) for x in (ours, theirs))
-    np.testing.assert_allclose(ours_psd, theirs_psd, rtol=5 * (2 / n) ** 0.5 * 2**0.5)
-
-
 def test_same_as_the_colorednoise_package_on_the_same_random_numbers(monkeypatch):
     """With its normal draws fed to ours, the sequences are equal.
 
@@ -102,12 +82,12 @@ def test_same_as_the_colorednoise_package_on_the_same_random_numbers(monkeypatch
 
 def test_sequences_of_environments_and_dimensions_are_independent():
     process = ColoredNoiseProcess(1.0, n_envs=3, action_dim=2, seq_len=1000, seed=1)
-    means = torch.stack([process.sample(1000).mean(0).flatten() for _ in range(4000)])  # (4000, 6)
+    means = torch.stack([process.sample(1000).mean(0).flatten() for _ in range(1000)])  # (1000, 6)
     correlation = torch.corrcoef(means.T) - torch.eye(6)
-    assert correlation.abs().max() < 5 / 4000**0.5
+    assert correlation.abs().max() < 5 / 1000**0.5
     # and anew after T steps: successive sequences do not correlate either
     successive = torch.corrcoef(torch.stack([means[:-1, 0], means[1:, 0]]))[0, 1]
-    assert abs(successive) < 5 / 4000**0.5
+    assert abs(successive) < 5 / 1000**0.5
 
 
 def test_one_beta_per_action_dimension():
@@ -130,26 +110,11 @@ def test_process_continues_over_the_ends_of_sequences():
     assert torch.equal(singles, blocks)
     assert not torch.equal(singles[:10], singles[10:20])
     assert not torch.equal(singles, ColoredNoiseProcess(0.5, 2, 3, 10, seed=4).sample(35))
+    unseeded = (ColoredNoiseProcess(0.5, 2, 3, 10).sample(35) for _ in range(2))
+    assert not torch.equal(*unseeded)
 
 
-def test_state_is_restored_in_mid_sequence():
-    process = ColoredNoiseProcess(1.0, 2, 1, seq_len=10, seed=3)
-    process.sample(7)
-    state = {k: v.clone() if torch.is_tensor(v) else v for k, v in process.state_dict().items()}
-    expected = process.sample(30)
-    other = ColoredNoiseProcess(1.0, 2, 1, seq_len=10, seed=99)
-    other.load_state_dict(state)
-    assert torch.equal(other.sample(30), expected)
-    assert other.index == process.index and torch.equal(other.buffer, process.buffer)
-    per_dimension = ColoredNoiseProcess([1.0], 2, 1, seq_len=10)  # the same beta, written otherwise
-    per_dimension.load_state_dict(state)
-    assert torch.equal(per_dimension.sample(30), expected)
-    for beta, n_envs, seq_len in [(1.0, 3, 10), (1.0, 2, 11), (1.1, 2, 10)]:
-        with pytest.raises(ValueError, match="noise state of (beta|size)"):
-            ColoredNoiseProcess(beta, n_envs, 1, seq_len=seq_len).load_state_dict(state)
-
-
-@pytest.mark.parametrize("n_sampled", [0, 9, 10, 25])
+@pytest.mark.parametrize("n_sampled", [0, 7, 10, 25])
 def test_a_state_is_small_and_continues_wherever_it_was_taken(n_sampled):
     """Also before the first value and at a sequence's end; through a file, as in a checkpoint."""
     process = ColoredNoiseProcess([0.0, 1.0], 3, 2, seq_len=10, seed=3)
@@ -158,12 +123,16 @@ def test_a_state_is_small_and_continues_wherever_it_was_taken(n_sampled):
     torch.save(process.state_dict(), file)
     expected = process.sample(30)
     file.seek(0)
+    state = torch.load(file, weights_only=True)
     other = ColoredNoiseProcess([0.0, 1.0], 3, 2, seq_len=10)
-    other.load_state_dict(torch.load(file, weights_only=True))
+    other.load_state_dict(state)
     assert torch.equal(other.sample(30), expected)
     big = io.BytesIO()
     torch.save(ColoredNoiseProcess(0.5, 4, 1, seq_len=100_000, seed=1).state_dict(), big)
     assert len(big.getvalue()) < 20_000  # bytes; the sequences are 1.6 MB
+    for beta, n_envs, seq_len in [([0.0, 1.0], 4, 10), ([0.0, 1.0], 3, 11), ([0.0, 1.1], 3, 10)]:
+        with pytest.raises(ValueError, match="noise state of (beta|size)"):
+            ColoredNoiseProcess(beta, n_envs, 2, seq_len=seq_len).load_state_dict(state)
 
 
 def test_on_a_gpu_where_there_is_one():
@@ -177,11 +146,6 @@ def test_on_a_gpu_where_there_is_one():
     process.sample(7)
     other.load_state_dict(process.state_dict())
     assert torch.equal(process.sample(20), other.sample(20))
-
-
-def test_processes_without_a_seed_differ():
-    first, second = (ColoredNoiseProcess(0.5, 2, 2, seq_len=10) for _ in range(2))
-    assert not torch.equal(first.sample(10), second.sample(10))
 
 
 def test_integers_of_numpy():
