@@ -70,10 +70,10 @@ def parse_args(argv=None, **defaults):
     add("--env-kwargs", type=json.loads, help="its keyword arguments, as in '{\"goal\": [3, 0]}'")
     add("--max-episode-steps", type=int, help="time limit in place of the environment's own")
     add("--rescale-actions", action=flag, default=False, help="map [-1, 1] to the action bounds")
-    add("--normalize-obs", action=flag, default=False, help="to running mean 0 and std 1")
-    add("--normalize-rewards", action=flag, default=False, help="to std 1 of discounted returns")
+    add("--normalize-obs", action=flag, default=False, help="by the mean and std up to now")
+    add("--normalize-rewards", action=flag, default=False, help="by the std of returns up to now")
     add = parser.add_argument_group("colored noise").add_argument
-    betas = "0 white, 1 pink, 2 red; one for each action dimension; auto: by the size of a batch"
+    betas = "0 white, 1 pink, 2 red; one, or one per action dimension; auto: for n_envs * n_steps"
     add("--beta", type=beta_or_auto, nargs="+", default=[0.5], help=betas)
     add("--noise-seq-len", type=int, default=1000, help="T, steps until new sequences are drawn")
     add("--vanilla", action="store_true", help="white noise of torch.randn, as in ordinary PPO")
@@ -94,9 +94,13 @@ def parse_args(argv=None, **defaults):
     add("--bootstrap-timeouts", action=flag, default=True, help="add gamma * V(obs) at time limits")
     running = parser.add_argument_group("running")
     add = running.add_argument
-    add("--envpool", action=flag, help="tasks in C++; by default where EnvPool has the task")
+    add("--envpool", action=flag, help="environments in C++; default: if EnvPool has the task")
     add("--threads", type=int, default=os.cpu_count(), help="threads that step environments")
-    add("--compile", action=flag, help="compile the loss; by default from 100,000 steps on")
+    add(
+        "--compile",
+        action=flag,
+        help="compile the loss: 10 to 40 s; default: from 100,000 steps on",
+    )
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
     add("--exp-name", default="ppo_colored_continuous", help="the experiment, a folder's name")
     add("--runs-dir", default="runs", help="folder of all runs")
@@ -202,7 +206,7 @@ def numpy_policy(actor):
 
 # --- The environments
 class FlatEnv(gym.Wrapper):
-    """Makes observations one float32 vector (a Dict in its order), and actions one; drops infos."""
+    """Observations are one float32 vector, actions one vector. Without infos, which take time."""
 
     def __init__(self, env, rescale_actions):
         super().__init__(env)
@@ -230,7 +234,7 @@ class FlatEnv(gym.Wrapper):
 
 
 def flat(space, obs):
-    """One float32 vector. Where spaces.flatten casts to the type of the space, this does not."""
+    """The observation as one float32 vector; spaces.flatten would first cast to the space's type."""
     if isinstance(space, spaces.Box):
         return np.asarray(obs, np.float32).flatten()
     if not isinstance(space, spaces.Dict | spaces.Tuple):
@@ -506,7 +510,7 @@ def lock(path):
 
 
 def write_file(path, content):
-    """Writes a text, or an object by torch.save, under another name first: never half a file."""
+    """Writes a text, or an object with torch.save. Renamed when whole: a file is never half there."""
     temporary = path.with_name(path.name + ".tmp")
     if isinstance(content, str):
         temporary.write_text(content)
@@ -575,7 +579,7 @@ class Run:
         self.writer = SummaryWriter(str(self.path), purge_step=global_step or None)
 
     def add_evaluation(self, step, returns, lengths, acting):
-        """Writes a row of evaluations.csv; and best.pt, what acted, if no return was better."""
+        """Writes a row of evaluations.csv; and best.pt, the policy, if its return is the best."""
         mean, std, length = returns.mean(), returns.std(), lengths.mean()
         if not np.isfinite(mean):
             raise FloatingPointError(f"return {mean} in {self.args.env_id}, evaluated at {step}")

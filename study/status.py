@@ -29,21 +29,18 @@ def run_state(folder):
     """The state of a run, and its hours if it is done, else the share of it that is left.
 
     "done": summary.json is there; "running": a process holds the lock; "failed": run_sweep.sh has
-    left a file of that name; else "to do". Hours are None where summary.json does not tell them.
+    left a file of that name; else "to do".
     """
-    try:
-        with open(f"{folder}/summary.json") as file:
-            return "done", json.load(file)["wall_seconds"] / 3600
-    except FileNotFoundError:
-        pass
-    except (ValueError, LookupError):  # the machine went down while the file was written
-        return "done", None
-    state = "running" if is_locked(f"{folder}/lock") else "to do"
-    if state == "to do" and os.path.exists(f"{folder}/failed"):
+    folder = Path(folder)
+    if (folder / "summary.json").exists():
+        summary = json.loads((folder / "summary.json").read_text())
+        return "done", summary["wall_seconds"] / 3600
+    state = "running" if is_locked(folder / "lock") else "to do"
+    if state == "to do" and (folder / "failed").exists():
         return "failed", 0
     try:
-        step = Path(folder, "evaluations.csv").read_text().splitlines()[-1].split(",")[0]
-        config = json.loads(Path(folder, "config.json").read_text())
+        step = (folder / "evaluations.csv").read_text().splitlines()[-1].split(",")[0]
+        config = json.loads((folder / "config.json").read_text())
         return state, 1 - int(step) / config["args"]["total_timesteps"]
     except (OSError, ValueError, LookupError):  # nothing is evaluated yet
         return state, 1
@@ -70,10 +67,10 @@ def status(folders, name):
         state, number = run_state(folder)
         environment = os.path.abspath(folder).split(os.sep)[-4]
         counts[environment][state] += 1
-        if state != "done":
-            left[environment] += number
-        elif number is not None:
+        if state == "done":
             hours[environment].append(number)
+        else:
+            left[environment] += number
     total = sum(counts.values(), Counter())
     every = [hour for of_env in hours.values() for hour in of_env]
     work = {env: left[env] * fmean(hours[env] or every) if every else None for env in counts}
