@@ -96,11 +96,7 @@ def parse_args(argv=None, **defaults):
     add = running.add_argument
     add("--envpool", action=flag, help="environments in C++; default: if EnvPool has the task")
     add("--threads", type=int, default=os.cpu_count(), help="threads that step environments")
-    add(
-        "--compile",
-        action=flag,
-        help="compile the loss: 10 to 40 s; default: from 100,000 steps on",
-    )
+    add("--compile", action=flag, help="compile the loss (10 to 40 s); default: from 100,000 steps")
     add("--device", default="cpu", help="torch device of the networks: cpu, cuda, cuda:1")
     add("--exp-name", default="ppo_colored_continuous", help="the experiment, a folder's name")
     add("--runs-dir", default="runs", help="folder of all runs")
@@ -234,7 +230,7 @@ class FlatEnv(gym.Wrapper):
 
 
 def flat(space, obs):
-    """The observation as one float32 vector; spaces.flatten would first cast to the space's type."""
+    """The observation as a float32 vector; spaces.flatten would first cast to the space's type."""
     if isinstance(space, spaces.Box):
         return np.asarray(obs, np.float32).flatten()
     if not isinstance(space, spaces.Dict | spaces.Tuple):
@@ -510,7 +506,7 @@ def lock(path):
 
 
 def write_file(path, content):
-    """Writes a text, or an object with torch.save. Renamed when whole: a file is never half there."""
+    """Writes a text, or an object with torch.save. A file gets its name when it is complete."""
     temporary = path.with_name(path.name + ".tmp")
     if isinstance(content, str):
         temporary.write_text(content)
