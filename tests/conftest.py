@@ -15,10 +15,9 @@ sys.path.insert(0, str(ROOT))
 import pytest  # noqa: E402
 
 SCRIPT = ROOT / "ppo_colored_continuous.py"
-TINY = "--total-timesteps 4096 --n-envs 2 --n-steps 256 --eval-freq 512 --eval-episodes 2 "
-TINY += "--n-epochs 1 --no-compile"
-EDITED = "--env-id Pendulum-v1 --total-timesteps 2048 --n-envs 2 --n-steps 256 --eval-freq 1024 "
-EDITED += "--eval-episodes 2 --n-epochs 1 --learning-rate 1e-2"
+SHORT = "--env-id Pendulum-v1 --n-envs 2 --n-steps 256 --eval-episodes 2 --n-epochs 1 "
+TINY = f"{SHORT} --total-timesteps 4096 --eval-freq 512 --no-compile"
+EDITED = f"{SHORT} --total-timesteps 2048 --eval-freq 1024 --learning-rate 1e-2"
 
 
 @pytest.fixture

@@ -23,11 +23,11 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
+import colored_noise
 import ppo_colored_continuous as ppo
 from colored_noise import ColoredNoiseProcess, projected_beta
 from study.sb3 import ColoredGaussian, EndAtTimeLimit
 
-SCRIPT = ppo.__file__
 N_STEPS, N_ENVS = 64, 3
 
 # --- Same weights and data as Stable-Baselines3, same numbers out
@@ -109,19 +109,6 @@ def fill_buffer(sb3, minibatch):
 
 def parameters(agent):
     return nn.utils.parameters_to_vector(agent.parameters()).detach()
-
-
-def test_network_is_the_same():
-    agent, sb3, _ = make_pair()
-    obs, actions, *_ = random_minibatch(agent)
-    logprobs, entropy, values = agent(obs, actions)
-    their_values, their_logprobs, their_entropy = sb3.policy.evaluate_actions(obs, actions)
-    torch.testing.assert_close(values, their_values.squeeze(-1))
-    torch.testing.assert_close(logprobs, their_logprobs)
-    torch.testing.assert_close(entropy.expand(len(obs)), their_entropy)
-    mean = ppo.numpy_policy(agent.actor_mean)(obs.numpy())
-    their_mean = sb3.policy.get_distribution(obs).distribution.mean
-    torch.testing.assert_close(torch.tensor(mean), their_mean.detach())
 
 
 def test_initial_weights_have_the_same_law():
@@ -321,20 +308,18 @@ def assert_complete_tiny_run(folder, read_evaluations, read_events, restarts=0):
     assert json.loads((folder / "summary.json").read_text())["steps"] == 4096
 
 
-@pytest.mark.parametrize("beta, reached", [("0.5", True), ("0", False)])
-def test_mountain_car_needs_colored_noise(train, beta, reached):
+def test_mountain_car_is_solved(train):
     """With larger learning rate and minibatches than the paper's, in 65,536 steps."""
     flags = "--learning-rate 3e-3 --batch-size 512 --total-timesteps 65536 --eval-freq 65536 "
-    folder = train(f"{flags} --eval-episodes 5 --beta {beta}")
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["final_return"] > 85 if reached else summary["final_return"] < 1
+    folder = train(f"{flags} --eval-episodes 5")
+    assert json.loads((folder / "summary.json").read_text())["final_return"] > 85
 
 
 def test_files_of_a_run(train, tiny, tmp_path, read_evaluations, read_events, capsys):
     """A finished run is not run again, but with --overwrite."""
     flags = f"{tiny} --beta 0.25 --seed 3 --exp-name test"
     folder = train(flags)
-    path = "runs/test/MountainCarContinuous-v0/beta_0.25/n_envs_2/seed_3"
+    path = "runs/test/Pendulum-v1/beta_0.25/n_envs_2/seed_3"
     assert folder == tmp_path / path
     assert_complete_tiny_run(folder, read_evaluations, read_events)
     config = json.loads((folder / "config.json").read_text())
@@ -342,7 +327,7 @@ def test_files_of_a_run(train, tiny, tmp_path, read_evaluations, read_events, ca
     rows, summary = read_evaluations(folder), json.loads((folder / "summary.json").read_text())
     assert summary["performance"] == pytest.approx(np.mean([row["return_mean"] for row in rows]))
     assert summary["final_return"] == rows[-1]["return_mean"] and summary["wall_seconds"] > 0
-    assert all(row["length_mean"] == 999 for row in rows)
+    assert all(row["length_mean"] == 200 for row in rows)
     best = torch.load(folder / "best.pt", weights_only=True)
     returns = {row["step"]: row["return_mean"] for row in rows}
     assert best["return_mean"] == pytest.approx(max(returns.values()))
@@ -388,7 +373,7 @@ def test_beta_auto():
 
 def test_kill_at_any_moment_and_resume(train, tiny, tmp_path, read_evaluations, read_events):
     """In the end everything is there once, and the noise went on where it was."""
-    flags = f"{tiny} --env-id Pendulum-v1 --resume"
+    flags = f"{tiny} --resume"
     args = parse(f"{flags} --runs-dir {tmp_path}/runs")
     folder, reached = ppo.run_path(args), 0
     table, checkpoint = folder / "evaluations.csv", folder / "checkpoint.pt"
@@ -437,7 +422,6 @@ def interrupted(train, flags, n):
 
 def test_resume_goes_on_from_the_checkpoint(train, tiny, tmp_path, read_evaluations, read_events):
     """Earlier evaluations stay, bit for bit, and the policy is the one that was saved."""
-    tiny += " --env-id Pendulum-v1"
     agent = interrupted(train, tiny, 5)
     folder = next((tmp_path / "runs").rglob("config.json")).parent
     before, first = (folder / "evaluations.csv").read_text(), []
@@ -463,9 +447,8 @@ def test_a_second_process_is_kept_out_and_the_lock_goes_with_the_run(train, tiny
     with filelock.FileLock(path / "lock"), pytest.raises(SystemExit) as ended:
         train(tiny)
     assert ended.value.code == 3
-    with pytest.raises(KeyboardInterrupt):  # in a notebook, say
-        train(tiny, learn=interrupt)
-    assert train(f"{tiny} --total-timesteps 512") == path
+    interrupted(train, tiny, 1)  # in a notebook, say
+    assert train(f"{tiny} --resume") == path
 
 
 def test_without_flock_there_is_no_lock_by_existence(train, tiny, tmp_path, monkeypatch):
@@ -479,15 +462,10 @@ def test_without_flock_there_is_no_lock_by_existence(train, tiny, tmp_path, monk
         train(tiny)
 
 
-def interrupt(*_):
-    raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize(
     "flags, words",
     [
         ("--n-envs 0", "must be positive"),
-        ("--n-envs many", "invalid int value"),
         ("--beta 0.5 auto", "auto is one value"),
         ("--resume --overwrite", "not allowed with"),
         ("--n-envs 64 --total-timesteps 100000", "no update before the last evaluation"),
@@ -527,8 +505,8 @@ gym.register("MyEnv-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episo
 
 def test_two_files_alone(tmp_path, read_evaluations):
     """In an empty folder: Gymnasium's, dm_control's and one's own tasks; and --resume."""
-    for name in ("ppo_colored_continuous.py", "colored_noise.py"):
-        shutil.copy(ppo.Path(SCRIPT).with_name(name), tmp_path)
+    for module in (ppo, colored_noise):
+        shutil.copy(module.__file__, tmp_path)
     (tmp_path / "my_env.py").write_text(MODULE)
     code = """
 import ppo_colored_continuous as ppo
@@ -665,12 +643,10 @@ def test_print_and_mistakes_in_the_loss(run_edited, capsys, flags):
 
 def test_an_edit_that_does_not_fit_the_checkpoint(run_edited, train, tiny, tmp_path):
     """--resume says so, and loses nothing of the run that is there."""
-    flags = "--env-id Pendulum-v1 --total-timesteps 2048 --n-envs 2 --n-steps 256 --eval-freq 1024 "
-    flags += "--eval-episodes 2 --n-epochs 1 --learning-rate 1e-2 --no-compile"  # as run_edited has
-    interrupted(train, flags, 3)
+    interrupted(train, f"{tiny} --learning-rate 1e-2", 3)  # as run_edited has it
     folder = next((tmp_path / "runs").rglob("config.json")).parent
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
     edit = (HIDDEN, f"            nn.LayerNorm(64),\n{HIDDEN}")
     with pytest.raises(RuntimeError, match="Missing key"):
-        run_edited(edit, again="--resume")
+        run_edited(edit, flags=tiny, again="--resume")
     assert {name: (folder / name).read_bytes() for name in before} == before
