@@ -683,6 +683,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         made_by = "EnvPool: make_env() is not called" if args.envpool else "make_env()"
         print(f"{run.path}: environments are made by {made_by}. After Ctrl-C, --resume continues")
         bar = tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True)
+        bar.mininterval = 0.5 if sys.stderr.isatty() else 60  # seconds
         while True:
             evaluate_due(run, agent, acting, eval_envs, global_step, args, bar)
             if global_step == total:

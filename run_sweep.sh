@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Carries out the paper's grids, each run in a process of its own on one core (--help says how).
-# How that is done stands here. Which runs there are, and the command line, stand in study/sweep.py.
+# Runs the paper's grids, each run in a process of its own on one core: --help tells how to use it.
+# Which runs there are, and the command line, stand in study/sweep.py.
 #
-# There is no queue and no database: a run's state is what lies in its folder.
-#   summary.json  it is complete
+# There is no queue and no database. The state of a run is what lies in its folder:
+#   summary.json  the run is complete
 #   failed        it failed: its exit code and error
-#   log.txt       all it said. While it runs a flock is on this file, which ends with its process.
-# Each sweep goes through the list and does what is free, and so two of them share the work.
+#   log.txt       its output. While it runs, its process has a flock on this file.
+# Each sweep goes through the list and takes runs that are free, so two sweeps share the work.
 
 ((BASH_VERSINFO[0] * 10 + BASH_VERSINFO[1] >= 44)) || { echo "bash 4.4 is needed" >&2; exit 2; }
 set -ufo pipefail # -f: words with * and ? stay as they are
@@ -66,7 +66,7 @@ report() { # lists what failed, and counts; true where all runs are complete
       echo "failed: $folder: $(<"$folder/failed")"
     fi
   done
-  ((failed == 0)) || echo "all they said is in log.txt there; --retry-failed takes them up again"
+  ((failed == 0)) || echo "their output is in log.txt there; --retry-failed runs them again"
   echo "$preset: $complete of ${#folders[@]} runs are complete, $failed failed"
   ((complete == ${#folders[@]}))
 }
@@ -101,7 +101,7 @@ main() {
   local python=${PYTHON:-python} scripts sweep go_on
   local mode preset runs_dir jobs retry_failed sbatch runs_per_task folders commands
   scripts=$(dirname "$(realpath "$0")")
-  export PYTHONPATH=$scripts${PYTHONPATH:+:$PYTHONPATH} TQDM_MININTERVAL=60 # for short logs
+  export PYTHONPATH=$scripts${PYTHONPATH:+:$PYTHONPATH}
   sweep=$(PYTHONSAFEPATH=1 "$python" -m study.sweep "$@") || exit # no study in the current folder
   [[ $sweep == mode=* ]] || { printf '%s\n' "$sweep"; exit; }
   eval "$sweep"

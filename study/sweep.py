@@ -40,10 +40,9 @@ without --retry-failed.
 Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
 """
 
-# The text above is the help of run_sweep.sh. What there is to run stands here: the paper's
-# experiments as lists of runs, each a folder and a command. How they are carried out stands there:
-# run_sweep.sh hands its command line on to this file, and shows its answer to the user (--help,
-# --print, --status) or evaluates it, assignments of bash.
+# The text above is the help of run_sweep.sh, which passes its command line on to this file. The
+# answer is a text for the user (--help, --print, --status), or else the list of runs, each a folder
+# and a command, as assignments that bash evaluates.
 
 import argparse
 import itertools
