@@ -319,8 +319,7 @@ def test_files_of_a_run(train, tiny, tmp_path, read_evaluations, read_events, ca
     """A finished run is not run again, but with --overwrite."""
     flags = f"{tiny} --beta 0.25 --seed 3 --exp-name test"
     folder = train(flags)
-    path = "runs/test/Pendulum-v1/beta_0.25/n_envs_2/seed_3"
-    assert folder == tmp_path / path
+    assert folder == tmp_path / "runs/test/Pendulum-v1/beta_0.25/n_envs_2/seed_3"
     assert_complete_tiny_run(folder, read_evaluations, read_events)
     config = json.loads((folder / "config.json").read_text())
     assert config["args"]["beta"] == [0.25] and config["versions"]["torch"].startswith("2.13.0")
