@@ -13,6 +13,7 @@ with its appendix.
 import argparse
 import math
 import re
+import textwrap
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -20,6 +21,7 @@ import numpy as np
 import pandas as pd
 import torch
 from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, NullLocator
 from scipy import stats
@@ -32,7 +34,7 @@ from study import claims, tables
 from study.environments import prepare_rendering
 from study.protocol import BETAS, COMPLEX, NAMES, SETTINGS
 from study.runs import CELL, Unusable, comparable, differences, need, published, same_protocol
-from study.statistics import cells_intervals, mean_interval, mean_intervals, standardize
+from study.statistics import FEW, cells_intervals, mean_interval, standardize
 
 # --- Drawing --------------------------------------------------------------------------------------
 
@@ -47,13 +49,18 @@ plt.rc("pdf", fonttype=42)  # TrueType: journals refuse Type 3 fonts
 INK = "0.25"  # what is not about one beta
 BETA = r"noise color $\beta$"
 BETA_NAMED = f"{BETA} (-1 blue, 0 white, 1 pink, 2 red)"
-PAPER = {"ls": ":", "lw": 0.9, "mfc": "none"}  # the published numbers: open markers
-METHOD_LOOK = {  # Okabe and Ito's colors, which color-blind readers can tell apart
-    "ppo": {"color": "#0072B2", "marker": "o"},
-    "trpo": {"color": "#D55E00", "marker": "s", "ls": "--"},
-    "a2c": {"color": "#000000", "marker": "^", "ls": ":"},
+LINES = [  # Okabe and Ito's colors, which color-blind readers can tell apart
+    {"color": "#0072B2", "marker": "o"},
+    {"color": "#D55E00", "marker": "s", "ls": "--"},
+    {"color": "#000000", "marker": "^", "ls": ":"},
+    {"color": "#009E73", "marker": "D", "ls": "-."},
+]
+VERDICT_LOOK = {
+    "holds": {"color": "#009E73", "marker": "o"},
+    "does not": {"color": "#D55E00", "marker": "X"},
+    "open": {"color": "0.4", "marker": "o", "mfc": "white"},
 }
-STANDARDIZED = "standardized performance\n(mean, 95 % BCa interval)"
+INTERVAL = "(mean, 95 % interval if two seeds)"
 
 
 def look(beta):
@@ -63,29 +70,26 @@ def look(beta):
     return {"color": plt.get_cmap("plasma")(0.82 * place / (len(BETAS) - 1)), "marker": marker}
 
 
-def color(beta):
-    return look(beta)["color"]
-
-
 def environments(count):
     return f"{count} environment{'s'[: count > 1]}"
 
 
 def extent(runs, of=None):
     """What a figure is made of, for its title; `of`: the runs that they were chosen from."""
-    n_envs, count = sorted(runs.n_envs.unique()), runs.environment.nunique()
-    text = f"{environments(count)}, n_envs {', '.join(map(str, n_envs))}"
-    cells, left = runs.groupby(CELL).ngroups, 0 if of is None else len(of) - len(runs)
-    text += f" ({cells} cells)" * (cells < count * len(n_envs)) + f", {len(runs)} runs"
+    there = runs.groupby("environment").n_envs.agg(lambda n: ", ".join(map(str, sorted(set(n)))))
+    counts = there.value_counts().sort_index()
+    parts = [f"n_envs {n} in {environments(count)}" for n, count in counts.items()]
+    text = textwrap.fill("; ".join([*parts, f"{len(runs)} runs"]), 62)
+    left = 0 if of is None else len(of) - len(runs)
     return text + f"\n(without {left} runs that lack a counterpart or a second seed)" * (left > 0)
 
 
-def panels(count, xlabel="", ylabel="", width=2.5, height=1.9):
+def panels(count, xlabel="", ylabel="", width=2.5, height=1.9, sharey=False):
     """A figure with a list of `count` axes, at most four in a row, labelled left and below."""
     rows = math.ceil(count / 4)
     columns = math.ceil(count / rows)
     size = max(width * columns, 5), height * rows + 0.5
-    fig, axes = plt.subplots(rows, columns, figsize=size, squeeze=False)
+    fig, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, sharey=sharey)
     for ax in axes.flat[count:]:
         ax.remove()
     axes = list(axes.flat[:count])
@@ -96,27 +100,30 @@ def panels(count, xlabel="", ylabel="", width=2.5, height=1.9):
     return fig, axes
 
 
-def legend_above(fig, *entries, betas=()):
-    """A legend over the panels: a marker per beta, then entries (label, style)."""
-    handles = [Line2D([], [], **look(b), ls="", label=rf"$\beta = {b:g}$") for b in betas]
-    handles += [Line2D([], [], **{"color": INK, **style}, label=label) for label, style in entries]
+def legend_above(fig, *entries, betas=(), paper=False):
+    """A legend over the panels: a marker per beta, then entries (label, style).
+
+    paper: whether the open markers of all betas are in it, which stand for the published numbers.
+    """
+    keys = {rf"$\beta = {beta:g}$": [look(beta) | {"ls": ""}] for beta in betas}
+    keys |= {"paper": [look(beta) | {"ls": "", "mfc": "none"} for beta in betas]} if paper else {}
+    keys |= {label: [{"color": INK, **style}] for label, style in entries}
+    handles = [tuple(Line2D([], [], **style) for style in styles) for styles in keys.values()]
     rows = -(-len(handles) // int(fig.get_figwidth() / 1.1))
-    fig.legend(handles=handles, loc="outside upper center", ncols=-(-len(handles) // rows))
+    how = {"loc": "outside upper center", "ncols": -(-len(handles) // rows)}
+    how |= {"handlelength": 3, "handler_map": {tuple: HandlerTuple(None)}}
+    fig.legend(handles, list(keys), **how)
 
 
-def beta_ticks(ax, betas, few=False):
-    """Ticks at the betas; with `few`, at five of the study's, where the labels would touch."""
-    if few and len(betas) > 4:
-        betas = [-1, 0, 0.5, 1, 2]
+def beta_ticks(ax, betas, most=8):
+    """Ticks at the betas; at five of the study's, where the labels of more than `most` touch."""
+    betas = betas if len(betas) <= most else [-1, 0, 0.5, 1, 2]
     ax.set_xticks(betas, [f"{beta:g}" for beta in betas])
 
 
 def log2_ticks(ax, values):
-    values = sorted(set(values))
-    powers = max(values) > 1000 and all(math.log2(value).is_integer() for value in values)
-    labels = [f"$2^{{{math.log2(value):g}}}$" if powers else f"{value:g}" for value in values]
     ax.set_xscale("log", base=2)
-    ax.set_xticks(values, labels)
+    ax.set_xticks(values, [f"{value:g}" for value in values])
     ax.xaxis.set_minor_locator(NullLocator())
 
 
@@ -126,11 +133,11 @@ def draw_intervals(ax, x, table, **style):
     ax.vlines(x, table.low, table.high, color=line.get_color(), lw=1.1)
 
 
-def draw_betas(ax, table, shift=0, **style):
+def draw_betas(ax, table):
     """Means with intervals over beta, the index of table, each in its color."""
-    ax.plot(table.index + shift, table["mean"], **{"color": "0.7", "zorder": 1, **style})
+    ax.plot(table.index, table["mean"], color="0.7", zorder=1)
     for beta in table.index:
-        draw_intervals(ax, [beta + shift], table.loc[[beta]], **look(beta))
+        draw_intervals(ax, [beta], table.loc[[beta]], **look(beta))
     beta_ticks(ax, table.index)
 
 
@@ -140,7 +147,7 @@ def draw_grid(ax, sizes, title):
         for row, (beta, size) in enumerate(sizes[n_envs].items()):
             if not np.isnan(size):
                 edge = "black" if size == sizes[n_envs].max() else "none"
-                style = {"s": 8 + 200 * size, "color": color(beta), "edgecolor": edge}
+                style = {"s": 8 + 200 * size, "color": look(beta)["color"], "edgecolor": edge}
                 ax.scatter(column, row, linewidth=1.4, **style)
     ax.set_xticks(range(sizes.shape[1]), sizes.columns)
     ax.set_yticks(range(len(sizes)), [f"{beta:g}" for beta in sizes.index])
@@ -163,7 +170,7 @@ def random_walks(betas):
         for ax, shown in zip(column, (walks, walk), strict=True):
             limit = 1.05 * np.abs(shown).max()
             for (x, y), alpha in zip(walk, (1, 0.75, 0.55, 0.4), strict=True):
-                ax.plot(x, y, color=color(beta), lw=0.6, alpha=alpha)
+                ax.plot(x, y, color=look(beta)["color"], lw=0.6, alpha=alpha)
             ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
             ax.locator_params(nbins=3)
             ax.tick_params(labelsize=7)
@@ -181,8 +188,8 @@ def power_spectral_density(betas):
     f = np.fft.rfftfreq(1000)[1:]
     for beta in betas:
         psd = torch.fft.rfft(draw_noise(beta, 1000).double()).abs().square().mean(0)[1:]
-        ax.loglog(f, psd, color=color(beta), lw=3, alpha=0.4)
-        ax.loglog(f, expected_psd(beta, 1000)[1:], color=color(beta), lw=1)
+        ax.loglog(f, psd, color=look(beta)["color"], lw=3, alpha=0.4)
+        ax.loglog(f, expected_psd(beta, 1000)[1:], color=look(beta)["color"], lw=1)
         ax.plot(f[0], psd[0], **look(beta))
     entries = [("measured", {"lw": 3, "alpha": 0.4}), (r"closed form, $f^{-\beta}$", {"lw": 1})]
     legend_above(fig, *entries, betas=betas)
@@ -196,7 +203,7 @@ def two_step_scatter(betas):
     for ax, beta in zip(axes, betas, strict=True):
         noise, lags = draw_noise(beta, 2000).numpy(), autocovariance(beta, 1000)
         correlation = np.corrcoef(noise[:, :-1].ravel(), noise[:, 1:].ravel())[0, 1]
-        ax.scatter(noise[:, 500], noise[:, 501], s=3, color=color(beta), alpha=0.5, lw=0)
+        ax.scatter(noise[:, 500], noise[:, 501], s=3, color=look(beta)["color"], alpha=0.5, lw=0)
         measured = f"correlation {correlation:z.2f}"
         ax.set_title(f"$\\beta = {beta:g}$, {measured}\n(closed form {lags[1] / lags[0]:z.2f})")
         ax.set(xlim=(-4.5, 4.5), ylim=(-4.5, 4.5), aspect="equal", xticks=[-4, -2, 0, 2, 4])
@@ -210,7 +217,7 @@ def marginal_distribution(betas):
     for ax, beta in zip(axes, betas, strict=True):
         noise, variance = draw_noise(beta, 5000), float(marginal_variance(beta, 1000))
         sample = noise[:, ::50].flatten().numpy()
-        ax.hist(sample, bins=x, density=True, color=color(beta), alpha=0.6)
+        ax.hist(sample, bins=x, density=True, color=look(beta)["color"], alpha=0.6)
         ax.plot(x, stats.norm.pdf(x, scale=variance**0.5), **line)
         ax.set_title(rf"$\beta = {beta:g}$, variance {noise.var():.2f} ({variance:.2f})")
         ax.set(ylim=(0, 0.45), xticks=[-4, -2, 0, 2, 4])
@@ -224,7 +231,7 @@ def bias(betas):
     for position, beta in enumerate(betas):
         means = draw_noise(beta, 5000).double().mean(1).numpy()
         for violin in left.violinplot(means, [position], widths=0.85, showextrema=False)["bodies"]:
-            violin.set(facecolor=color(beta), alpha=0.8)
+            violin.set(facecolor=look(beta)["color"], alpha=0.8)
         right.plot(beta, means.std(), **look(beta), ls="", zorder=3)
     curve = np.linspace(min(betas) - 0.1, max(betas) + 0.1, 200)
     right.plot(curve, mean_std(curve, 1000), color=INK, lw=1)
@@ -238,12 +245,6 @@ def bias(betas):
 # --- Figures of the results -----------------------------------------------------------------------
 
 
-def standardized(runs, axes, cells):
-    """The `comparable` runs, with their standardized performance as the column z."""
-    chosen = comparable(runs, axes, cells)
-    return chosen.assign(z=standardize(chosen))
-
-
 def compare(runs, x, cells, by=None):
     """Performance over x: "beta", "n_envs" or "update_size". A line for each value of column `by`.
 
@@ -252,71 +253,34 @@ def compare(runs, x, cells, by=None):
     Colored-Noise Affect the Performance") or betas ("How Does the Number of Parallel Collection
     Environments").
     """
-    need(by or runs[x].nunique() > 1, f"at least two values of {x}")
-    chosen = standardized(runs, [x, by] if by else [x], cells)
+    need(runs[by or x].nunique() > 1, f"at least two values of {by or x}")
+    chosen = comparable(runs, [x, by] if by else [x], cells)
+    chosen = chosen.assign(z=standardize(chosen))
     xlabel = {"beta": BETA_NAMED, "update_size": "update size n_envs \u00b7 n_steps"}.get(x, x)
-    fig, [ax] = panels(1, xlabel, STANDARDIZED, height=3)
-    lines, unknown = [], False
+    fig, [ax] = panels(1, xlabel, f"standardized performance\n{INTERVAL}", height=3)
+    lines = []
     for i, (value, group) in enumerate(chosen.groupby(by) if by else [("", chosen)]):
-        gray = ["0.1", "0.65", "0.4", "0.75"][i % 4] if by else INK
-        style = {"color": gray, "ls": ["-", "--", ":", "-."][i % 4], "lw": 1}
+        style = LINES[i % 4] if by else {"color": INK}
         table = cells_intervals(group, "z", x, cells)
-        unknown |= table.low.isna().any()
-        if x == "beta":
-            draw_betas(ax, table, shift=0.006 * i, **style)
-        else:
-            style["marker"] = "os^D"[i % 4]
-            draw_intervals(ax, table.index * 2 ** (0.08 * i), table, **style)
-            log2_ticks(ax, chosen[x])
+        if x == "beta" and not by:
+            draw_betas(ax, table)
+        else:  # lines stand beside each other, so that their intervals can be seen
+            shifted = table.index + 0.01 * i if x == "beta" else table.index * 2 ** (0.08 * i)
+            draw_intervals(ax, shifted, table, **style)
         lines.append((value if isinstance(value, str) else f"{by} = {value}", style))
-    no_interval = "\n(no interval where a cell has one run)" * bool(unknown)
-    ax.set_title(extent(chosen, runs) + no_interval)
+    (beta_ticks if x == "beta" else log2_ticks)(ax, sorted(chosen[x].unique()))
+    ax.set_title(extent(chosen, runs))
     if by:
         legend_above(fig, *lines)
     return fig
 
 
-def beta0_vs_vanilla(runs):
-    """Sec. A6: beta 0 matches vanilla PPO. runs: with any beta, and vanilla."""
-    runs = runs[(runs.beta == 0) | runs.vanilla]
-    need(runs.vanilla.nunique() == 2, "runs with --beta 0 and runs with --vanilla")
-    runs = runs.assign(algorithm=np.where(runs.vanilla, "vanilla PPO", r"$\beta = 0$"))
-    return compare(runs, "n_envs", ["environment"], "algorithm")
-
-
-def n_envs_vs_n_steps(runs):
-    """Sec. A11: at beta 0.5, what matters is n_envs * n_steps. runs: with any n_steps."""
-    runs = runs[runs.beta == 0.5]
-    need(runs.n_steps.nunique() > 1, "runs with --beta 0.5 and at least two values of --n-steps")
-    runs = runs.assign(update_size=runs.n_envs * runs.n_steps)
-    return compare(runs, "update_size", ["environment"], "n_steps")
-
-
-def n_epochs_vs_beta(runs):
-    """Sec. A12: the preferred beta for each n_epochs. runs: with any n_epochs."""
-    need(runs.n_epochs.nunique() > 1, "at least two values of --n-epochs")
-    there = runs.groupby([*CELL, "beta"]).n_epochs.transform("nunique")
-    return compare(runs[there == there.max()], "beta", CELL, "n_epochs")
-
-
 def n_envs_beta_grids(runs):
-    """Sec. "How Does the Number [...] and Noise Color Interact": marker size = performance^6, rank.
+    """Sec. "How Does the Number [...] and Noise Color Interact": of `rank_grids`, larger is better.
 
-    Beside them are the ranks projected from the bias of the noise: by our best betas and, where
-    the runs have the study's protocol, by the paper's.
+    The first panel's markers show the performance to the sixth power, the others' ranks.
     """
-    need(runs.beta.nunique() > 1, "at least two betas")
-    grid, chosen = tables.performance_grid(runs)
-    lengths = chosen.noise_seq_len.unique()
-    need(len(lengths) == 1, "one --noise-seq-len, of all environments: the projection goes by it")
-    best = {"our": grid.idxmax()}
-    if not differences(chosen).any():
-        best["the paper's"] = published("best_beta_per_n_envs").set_index("n_envs").best_beta
-    ranks = {"rank of performance within n_envs": -grid}
-    for whose, betas in best.items():
-        projected = tables.projected_ranks(betas, grid.index, grid.columns, int(lengths[0]))
-        title = f"rank projected from the bias,\nby {whose} best $\\beta$"
-        ranks[title] = projected.where(grid.notna())
+    grid, ranks, chosen = tables.rank_grids(runs)
     fig, axes = panels(1 + len(ranks), "n_envs", BETA, width=2.9, height=3.1)
     low, high = np.nanmin(grid), np.nanmax(grid)
     draw_grid(axes[0], ((grid - low) / (high - low or 1)) ** 6, "performance, to the sixth power")
@@ -328,22 +292,17 @@ def n_envs_beta_grids(runs):
     return fig
 
 
-def three_betas(runs):
-    """The betas to draw curves of: more than three lines in a panel cannot be told apart."""
-    there = sorted(runs.beta.unique())
-    first = [beta for beta in (0, 0.5, 1) if beta in there]
-    return sorted((first + [beta for beta in there if beta not in first])[:3])
-
-
 def learning_curves(runs, curves, by):
     """Sec. A10: mean return over training, a panel per value of `by`, a line per beta.
 
-    A band is a line's interval. Open markers at the right end are the published final returns,
-    where the runs have the study's protocol.
+    A band is a line's interval; with fewer seeds than FEW it would be too narrow, and the
+    runs are drawn instead. Open markers at the right end are the published final returns, where the
+    runs have the study's protocol.
     """
     paper = published("final_return_per_beta").set_index([*CELL, "beta"]).final_return_mean
-    as_in_study = differences(runs) == ""
-    fig, axes = panels(runs[by].nunique(), "environment steps", "mean return")
+    as_in_study, one_task = differences(runs) == "", by == "n_envs"
+    labels = "environment steps", "mean return"
+    fig, axes = panels(runs[by].nunique(), *labels, height=2, sharey=one_task)
     for ax, (_, group) in zip(axes, runs.groupby(by), strict=True):
         environment, n_envs = group[CELL].iloc[0]
         lines = curves.loc[group.index].dropna(axis=1, how="all")
@@ -351,48 +310,34 @@ def learning_curves(runs, curves, by):
         ax.axvline(end, color="0.8", lw=0.8)
         for i, (beta, seeds) in enumerate(group.groupby("beta")):
             line = lines.loc[seeds.index].dropna(axis=1)
-            mean, low, high = mean_interval(line, n_resamples=1000)
             marks = {"markevery": (i * every // 3 % line.shape[1], every), "ms": 4}
-            ax.plot(line.columns, mean, **look(beta), **marks)
-            ax.fill_between(line.columns, low, high, color=color(beta), alpha=0.2, lw=0)
+            ax.plot(line.columns, line.mean(), **look(beta), **marks)
+            if len(line) < FEW:
+                ax.plot(line.columns, line.T, color=look(beta)["color"], alpha=0.4, lw=0.5)
+            else:
+                _, low, high = mean_interval(line, n_resamples=1000)
+                ax.fill_between(line.columns, low, high, color=look(beta)["color"], alpha=0.2, lw=0)
             if as_in_study[seeds.index].all():
                 final = paper.get((environment, n_envs, f"{beta:g}"), np.nan)
                 ax.plot(1.05 * end, final, mfc="none", **look(beta))
-        ax.set_title(f"{environment}, n_envs {n_envs}")
+        counts = sorted(set(group.groupby("beta").size().tolist()))
+        seeds = f"{' or '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)}"
+        ax.set_title(f"{environment}\nn_envs {n_envs}, {seeds}")
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
-    entries = [("95 % BCa interval", {"lw": 6, "alpha": 0.3})]
-    entries += [("paper", {"marker": "o", "ls": "", "mfc": "none"})] * bool(as_in_study.any())
-    legend_above(fig, *entries, betas=sorted(runs.beta.unique()))
+    sizes = runs.groupby([by, "beta"]).size()
+    entries = [("95 % BCa interval", {"lw": 6, "alpha": 0.3})] * int(sizes.max() >= FEW)
+    entries += [(f"runs, if fewer than {FEW}", {"lw": 0.5, "alpha": 0.6})] * int(sizes.min() < FEW)
+    betas = sorted(runs.beta.unique())
+    legend_above(fig, *entries, betas=betas, paper=bool(as_in_study.any()))
     return fig
 
 
 def transfer(runs):
-    """Sec. A7: standardized performance against beta of (a) TRPO, (b) A2C, (c) all with PPO's.
-
-    runs: of the three methods, n_envs 4. (a) and (b) are standardized over one method's runs in an
-    environment, (c) over all; each over the environments that have all betas (of all methods).
-    """
-    methods = [method for method in METHOD_LOOK if (runs.method == method).any()]
-    need(set(methods) - {"ppo"}, "runs of TRPO or A2C with n_envs 4")
-    groups = {name.upper(): runs[runs.method == name] for name in methods if name != "ppo"}
-    shared = set.intersection(*(set(runs.beta[runs.method == name]) for name in methods))
-    if len(methods) > 1 and shared:
-        groups["overall"] = same_protocol(runs[runs.beta.isin(shared)])
-    for name, group in groups.items():
-        groups[name] = standardized(group, ["method", "beta"], ["environment"])
-    fig, axes = panels(len(groups), BETA, STANDARDIZED, width=3.2, height=2.8)
-    for ax, (name, group) in zip(axes, groups.items(), strict=True):
-        for i, (method, part) in enumerate(group.groupby("method")):
-            table = cells_intervals(part, "z", "beta", ["environment"])
-            if name == "overall":
-                draw_intervals(ax, table.index + 0.03 * (i - 1), table, **METHOD_LOOK[method])
-            else:
-                draw_betas(ax, table)
-        beta_ticks(ax, sorted(group.beta.unique()), few=True)
-        ax.set_title(f"{name}\n{environments(group.environment.nunique())}, {len(group)} runs")
-    if "overall" in groups:
-        legend_above(fig, *((method.upper(), METHOD_LOOK[method]) for method in methods))
-    return fig
+    """Sec. A7: performance of TRPO and A2C against beta, with PPO's, at the betas that all have."""
+    counts = runs.groupby("beta").method.transform("nunique")
+    shared = same_protocol(runs[counts == runs.method.nunique()])
+    shared = shared.assign(method=shared.method.str.upper())
+    return compare(shared, "beta", ["environment"], "method")
 
 
 def gsde_vs_beta(runs):
@@ -401,12 +346,11 @@ def gsde_vs_beta(runs):
     shared = [argument for argument in SETTINGS if argument != "method"]
     runs = same_protocol(runs, [*shared, "bootstrap_timeouts"])
     runs = runs.assign(noise=runs.beta.fillna(np.inf))  # inf: gSDE
-    chosen = standardized(runs, ["noise"], CELL)
-    table = cells_intervals(chosen, "z", "noise", CELL)
+    chosen = comparable(runs, ["noise"], CELL)
+    table = cells_intervals(chosen.assign(z=standardize(chosen)), "z", "noise", CELL)
     betas, gsde = table.drop(np.inf), table.loc[[np.inf]]
-    fig, [ax] = panels(1, BETA_NAMED, STANDARDIZED, height=3)
+    fig, [ax] = panels(1, BETA_NAMED, f"standardized performance\n{INTERVAL}", height=3)
     x = betas.index.max() + 0.5
-    ax.axhspan(*gsde[["low", "high"]].iloc[0], color=INK, alpha=0.12, lw=0)
     ax.axhline(gsde["mean"].iloc[0], color=INK, ls="--", lw=1)
     draw_betas(ax, betas)
     draw_intervals(ax, [x], gsde, color=INK, marker="h", ms=7)
@@ -420,38 +364,14 @@ def complex_tasks(runs):
     runs = runs[runs.env_id.isin(COMPLEX)]
     need(len(runs), f"runs of {', '.join(COMPLEX)}")
     chosen = pd.concat(comparable(x, ["beta"], ["n_envs"]) for _, x in runs.groupby("environment"))
-    ylabel = "performance\n(mean, 95 % BCa interval)"
-    fig, axes = panels(chosen.environment.nunique(), BETA, ylabel)
+    fig, axes = panels(chosen.environment.nunique(), BETA, f"performance\n{INTERVAL}", height=2.2)
     for ax, (environment, group) in zip(axes, chosen.groupby("environment"), strict=True):
-        table = cells_intervals(group, "performance", "beta", ["n_envs"])
-        draw_betas(ax, table)
-        no_interval = "\n(one run each: no interval)" * bool(table.low.isna().any())
-        ax.set_title(environment + no_interval)
-        ax.set(xticks=[-1, 0, 1, 2], xticklabels=["-1", "0", "1", "2"])
+        draw_betas(ax, cells_intervals(group, "performance", "beta", ["n_envs"]))
+        ax.set_title(environment)
+        ax.update_datalim([(0, 0), (0, 1)])  # 0, and 1 for the goal, are in sight
+        ax.autoscale_view()
+        beta_ticks(ax, sorted(group.beta.unique()), 3)
     fig.suptitle(extent(chosen, runs), fontsize=9)
-    return fig
-
-
-def final_return_vs_n_envs(table, betas):
-    """Final return against n_envs per beta, ours (filled) over the published (open).
-
-    table: of `final_returns`; betas: those to draw.
-    """
-    table = table[table.beta != "vanilla"].astype({"beta": float})
-    table = table[table.beta.isin(betas)]
-    need(len(table), "runs with colored noise")
-    fig, axes = panels(table.environment.nunique(), "n_envs", "final return")
-    for ax, (environment, group) in zip(axes, table.groupby("environment"), strict=True):
-        for beta, cells in group.groupby("beta"):
-            # The betas of one n_envs stand side by side
-            x = cells.n_envs * 2 ** (0.5 * (betas.index(beta) + 0.5) / len(betas) - 0.25)
-            ax.plot(x, cells.paper, **look(beta), **PAPER, ms=7)
-            draw_intervals(ax, x, cells, **look(beta), ms=4)
-        log2_ticks(ax, table.n_envs)
-        ax.set(title=environment, xlim=(table.n_envs.min() / 1.5, table.n_envs.max() * 1.5))
-    ours = ("ours, 95 % BCa interval", {"marker": "o", "ms": 4})
-    paper = ("paper", {**PAPER, "marker": "o", "ms": 7})
-    legend_above(fig, ours, *[paper] * bool(table.paper.notna().any()), betas=betas)
     return fig
 
 
@@ -461,42 +381,65 @@ def beside_published(averages, runs):
     averages: the table of `average_final_returns`.
     """
     runs = tables.on_published_scale(runs)
-    cells = mean_intervals(runs, "final_return", [*CELL, "beta"])
-    cells["paper"] = runs.groupby([*CELL, "beta"]).paper.first()
-    fig, axes = panels(1 + averages.n_envs.nunique(), BETA, height=2.6)
+    cells = runs.groupby([*CELL, "beta"])[["final_return", "paper"]].mean()
+    how = {"height": 2.6, "sharey": True}
+    fig, axes = panels(1 + averages.n_envs.nunique(), BETA, "our final return", **how)
     axes[0].axline((0, 0), slope=1, color="0.6", lw=0.9)
     for beta, group in cells.groupby("beta"):
-        draw_intervals(axes[0], group.paper, group, **look(beta), ls="", ms=4)
-    axes[0].set_title(f"{len(cells)} cells")
-    axes[0].set_ylabel("our final return\n(0 to 1: the paper's lowest to highest)")
-    axes[0].set_xlabel("published final return")
+        axes[0].plot(group.paper, group.final_return, **look(beta), ls="", ms=4, alpha=0.8)
+    axes[0].set(title=f"{len(cells)} cells", xlabel="published final return")
     for ax, (n_envs, table) in zip(axes[1:], averages.groupby("n_envs"), strict=True):
         table = table.set_index("beta")
-        ax.plot(table.index, table.paper, **PAPER, color="0.7")
+        ax.plot(table.index, table.paper, color="0.7", ls=":", lw=0.9)
         for beta, paper in table.paper.items():
-            ax.plot(beta, paper, **look(beta), **PAPER, ms=8)
+            ax.plot(beta, paper, **look(beta), mfc="none", ms=8)
         draw_betas(ax, table)
-        beta_ticks(ax, table.index, few=True)
+        beta_ticks(ax, table.index, 4)
         ax.set_title(f"n_envs {n_envs}, {environments(int(table.environments.iloc[0]))}")
-        ax.set_ylabel("averaged over environments")
-    paper = ("paper", {**PAPER, "marker": "o", "ms": 8})
-    ours = ("ours, 95 % BCa interval", {"marker": "o"})
-    legend_above(fig, ours, paper, betas=sorted(cells.index.unique("beta")))
+    interval = ("95 % BCa interval", {"lw": 1.1})
+    legend_above(fig, interval, betas=sorted(cells.index.unique("beta")), paper=True)
+    fig.supxlabel("0 is the environment's lowest published mean, 1 its highest", size=8)
     return fig
 
 
-def robust_performance(table):
-    """Beyond the paper: interquartile mean, probability of improvement, of `robust_statistics`."""
-    need(table.improvement.notna().any(), "beta 0 and another beta in one environment and n_envs")
-    fig, axes = panels(2, BETA_NAMED, width=5, height=2.8)
-    for ax, name in zip(axes, ("iqm", "improvement"), strict=True):
-        columns = {name: "mean", f"{name}_low": "low", f"{name}_high": "high"}
-        draw_betas(ax, table.set_index("beta").rename(columns=columns).dropna(subset="mean"))
-    axes[0].set_ylabel("standardized performance\n(interquartile mean)")
-    axes[1].set_ylabel("probability of doing\nbetter than $\\beta = 0$")
-    axes[1].axhline(0.5, color=INK, ls="--", lw=0.9)
-    made_of = f"{table.cells.iloc[0]} cells of environment and n_envs, {table.runs.sum()} runs"
-    fig.suptitle(f"95 % stratified bootstrap intervals, {made_of}", fontsize=9)
+def verdicts(table):
+    """What the runs say of each claim: its interval, what it must be between, the verdict in words.
+
+    table: of `study.claims.coverage`. Claims of one unit share an axis, at whose ends much longer
+    intervals than the others are cut. Where there is none, the text says why. Left out are claims
+    that nothing is tested for, and those that there are no runs for.
+    """
+    table = table[table.verdict != ""]
+    unknown = table.data.str.fullmatch("no runs[^;]*")
+    table, open_ones = table[~unknown], unknown.sum()
+    need(len(table), "runs of a claim")
+    units = {unit: rows for unit, rows in table.groupby("unit", sort=False)}
+    counts = [len(rows) for rows in units.values()]
+    size = 10, 0.22 * sum(counts) + 0.6 * len(units) + 0.4
+    fig, axes = plt.subplots(len(units), figsize=size, squeeze=False, height_ratios=counts)
+    for ax, (unit, rows) in zip(axes[:, 0], units.items(), strict=True):
+        length = rows.high - rows.low
+        seen = rows[~(length > 4 * length.median())]
+        left, right = np.nan_to_num([seen.low.min(), seen.high.max()])
+        pad = 0.05 * (right - left) or 1
+        ends = ax.set_xlim(min(left, 0) - pad, max(right, 0) + pad)
+        for place, row in enumerate(rows.itertuples()):
+            style, where = VERDICT_LOOK[row.verdict], {"transform": ax.get_yaxis_transform()}
+            if np.isnan(row.low):
+                text = "closed form" if row.runs == "none needed" else row.data
+                text = textwrap.fill(textwrap.shorten(text, 130, placeholder=" ..."), 68)
+                ax.text(0.01, place, text, va="center", color="0.4", size=6, **where)
+            else:
+                must = np.clip([row.least, row.most], *ends)
+                ax.fill_betweenx([place - 0.4, place + 0.4], *must, color="0.92", lw=0)
+                ax.plot([row.low, row.high], [place, place], color=style["color"])
+                ax.plot(row.mean, place, **style)
+            ax.text(1.01, place, row.verdict, va="center", color=style["color"], **where)
+        ax.set_yticks(range(len(rows)), [f"{row.where}: {row.says}" for row in rows.itertuples()])
+        ax.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
+        ax.grid(visible=False, axis="y")
+    title = "95 % intervals, longer where several are compared; to hold, it must lie in the gray\n"
+    fig.suptitle(f"{title}({open_ones} more claims are open for lack of runs)", fontsize=9)
     return fig
 
 
@@ -517,15 +460,10 @@ def first_frame(env_id):
 
 
 def contact_sheet():
-    """A frame of each of the paper's environments, in the order of its figure of them (Sec. A4)."""
-    tasks = ["cartpole-balance_sparse", "cartpole-swingup_sparse", "ball_in_cup-catch"]
-    tasks += ["hopper-hop", "cheetah-run", "walker-run", "reacher-hard", "pendulum-swingup"]
-    ids = ["MountainCarContinuous-v0", *(f"dm_control/{task}-v0" for task in tasks), "door-v0"]
-    ids += ["PointUMaze-v1", "AntUMaze-v1", "Point4Rooms-v1", "SwimmerUMaze-v1"]
-    ids += ["Swimmer4Rooms-v1", "Ant4Rooms-v1", *COMPLEX]
+    """A frame of each of the paper's environments."""
     prepare_rendering()
     fig, axes = plt.subplots(4, 5, figsize=(12, 10.2))
-    for ax, env_id in zip(axes.flat, ids, strict=True):
+    for ax, env_id in zip(axes.flat, NAMES, strict=True):
         ax.imshow(first_frame(env_id))
         ax.set(xticks=[], yticks=[])
         ax.set_title(NAMES[env_id], fontsize=12)
@@ -571,7 +509,7 @@ def animation(betas, n_frames=100, **cars):
         ax.fill_between(hill, height(hill), color="0.85", lw=0)
         ax.plot([goal] * 2, [0.99, 1.3], color=INK, lw=1.5)
         ax.fill([goal, goal, goal + 0.12], [1.3, 1.18, 1.24], color="#D55E00", lw=0)
-        dots += ax.plot([], [], "o", color=color(beta), ms=3.5, alpha=0.7, mew=0)
+        dots += ax.plot([], [], "o", color=look(beta)["color"], ms=3.5, alpha=0.7, mew=0)
         ax.set(title="\n", xlim=(-1.2, 0.62), ylim=(0, 1.4), xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
 
@@ -595,9 +533,14 @@ def make_all(todo, out):
     """Makes and writes figures (PNG, PDF) and tables (CSV, Markdown, LaTeX).
 
     todo: {name: (function, data, other arguments ...)}; data may be the name of an earlier table.
-    Returns those made, by name, and a line for each that could not be made.
+    Removes those of earlier data. Returns those made, by name, and a line for each that could not
+    be made.
     """
     made, not_made = {}, []
+    out.mkdir(parents=True, exist_ok=True)
+    for path in out.iterdir():
+        if path.stem in todo or path.match("learning_curves_*.p??"):
+            path.unlink()  # of earlier data
     for name, (make, data, *rest) in tqdm(todo.items(), desc="tables and figures", unit=""):
         try:
             if isinstance(data, str):
@@ -646,31 +589,35 @@ def results(methods, curves, betas):
 
     runs = next(iter(methods.values()))
     grid, _ = study.runs.main_grid(runs)
-    colored, main, every = grid[~grid.vanilla], averaged(grid), averaged(runs)
-    same_epochs = every[every.n_epochs.isin(grid.n_epochs[:1])]
-    same_steps = every[every.n_steps.isin(grid.n_steps[:1])]
-    three = of("ppo", "trpo", "a2c")
+    colored, every, main = grid[~grid.vanilla], averaged(runs), claims.of_most(averaged(grid))
+    white = grid[((grid.beta == 0) | grid.vanilla) & ~grid.env_id.isin(COMPLEX)]
+    white = white.assign(algorithm=np.where(white.vanilla, "vanilla PPO", r"$\beta = 0$"))
+    half = every[(every.beta == 0.5) & every.n_epochs.isin(grid.n_epochs[:1])]
+    half = half.assign(update_size=half.n_envs * half.n_steps)
+    epochs = every[every.n_steps.isin(grid.n_steps[:1])]
+    counts = epochs.groupby([*CELL, "beta"]).n_epochs.transform("nunique")
     todo = {
-        "best_beta_per_env": (tables.best_beta_per_env, main),
+        "best_beta_per_env": (tables.best_beta_per_env, averaged(grid)),
         "best_beta_per_n_envs": (tables.best_beta_per_n_envs, main),
         "final_return_and_performance": (tables.final_return_and_performance, colored),
         "final_returns": (tables.final_returns, grid),
         "final_return_per_beta": (tables.final_return_per_beta, "final_returns"),
         "average_final_returns": (tables.average_final_returns, main),
-        "robust_statistics": (tables.robust_statistics, main),
         "performance_vs_beta": (compare, main, "beta", CELL),
         "performance_vs_n_envs": (compare, main, "n_envs", ["environment", "beta"]),
         "n_envs_beta_grids": (n_envs_beta_grids, main),
-        "beta0_vs_vanilla": (beta0_vs_vanilla, grid[~grid.env_id.isin(COMPLEX)]),
-        "n_envs_vs_n_steps": (n_envs_vs_n_steps, same_epochs),
-        "n_epochs_vs_beta": (n_epochs_vs_beta, same_steps),
-        "transfer": (transfer, three[three.n_envs == 4]),
+        # Sec. A6: beta 0 matches vanilla PPO
+        "beta0_vs_vanilla": (compare, white, "n_envs", ["environment"], "algorithm"),
+        # Sec. A11: at beta 0.5, what matters is n_envs * n_steps
+        "n_envs_vs_n_steps": (compare, half, "update_size", ["environment"], "n_steps"),
+        # Sec. A12: the preferred beta for each n_epochs, of the betas that have all of these
+        "n_epochs_vs_beta": (compare, epochs[counts == counts.max()], "beta", CELL, "n_epochs"),
+        "transfer": (transfer, of("ppo", "trpo", "a2c").query("n_envs == 4")),
         "complex_tasks": (complex_tasks, colored),
         "gsde_vs_beta": (gsde_vs_beta, of("ppo", "gsde")),
         "coverage": (claims.coverage, methods, curves),
-        "final_return_vs_n_envs": (final_return_vs_n_envs, "final_returns", betas),
-        "beside_published": (beside_published, "average_final_returns", main),
-        "robust_performance": (robust_performance, "robust_statistics"),
+        "claims": (verdicts, "coverage"),
+        "beside_published": (beside_published, "average_final_returns", averaged(grid)),
     }
     lines = colored[colored.beta.isin(betas)]
     for n_envs, group in lines.groupby("n_envs"):
@@ -682,42 +629,26 @@ def results(methods, curves, betas):
     return todo
 
 
-def remove_earlier(out):
-    """Removes what an earlier command made in this folder, by its report: it is of other data."""
-    report = out / "report.txt"
-    first = report.read_text().partition("\n")[0] if report.exists() else ""
-    if first.startswith("made: "):
-        for name in first.removeprefix("made: ").split(", "):
-            for suffix in ("png", "pdf", "csv", "md", "tex"):
-                (out / f"{name}.{suffix}").unlink(missing_ok=True)
-
-
 def draw_results(args):
     """The command `results`: makes all that the runs allow, and reports what is left out."""
     runs, curves = study.runs.load(args.paths, args.env, args.beta, args.n_envs)
     methods, left_out = study.runs.select_methods(runs, args.method)
     runs = methods.pop(args.method)
     need(len(runs) or args.method == "ppo", f"a complete run of the method {args.method}")
-    others = [f"{name}: {len(each)} runs" for name, each in methods.items()]
     grid, dropped = study.runs.main_grid(runs)
     parts = [part for _, part in grid.groupby(grid.env_id.isin(COMPLEX))]
     asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
-    betas = asked or three_betas(grid[~grid.vanilla])
-    no_curves = [f"beta {beta:g}" for beta in sorted(set(grid.beta.dropna()) - set(betas))]
-    no_curves += ["vanilla PPO, never"] * int(grid.vanilla.any())
-    args.out.mkdir(parents=True, exist_ok=True)
-    remove_earlier(args.out)
-    made, not_made = make_all(results({args.method: runs, **methods}, curves, betas), args.out)
+    there = sorted(grid.beta.dropna().unique())
+    three = there if len(there) < 4 else [b for b in there if b in (0, 0.5, 1)] or there[:3]
+    todo = results({args.method: runs, **methods}, curves, asked or three)
+    made, not_made = make_all(todo, args.out)
     beside = [claims.outside(made["final_returns"])[-1]] if "final_returns" in made else []
     beside += claims.offset(grid) if "beside_published" in made else []
-    mixed = study.runs.mixed_evaluations(runs)
     report = {
         "left out": left_out,
-        "of other methods, only where these are compared": others,
         "only where n_steps or n_epochs vary, in no other figure or table": dropped,
         "missing from the grid of these runs": sum(map(study.runs.missing, parts), []),
-        "averaged though evaluated differently (the mean is the same)": mixed,
-        "not among the learning curves (--beta chooses)": no_curves,
+        "averaged though evaluated differently": study.runs.mixed_evaluations(runs),
         "not made": not_made,
         "final returns beside the published": beside,
     }
@@ -740,17 +671,14 @@ def parse_args():
     sheet = commands.add_parser("environments", help="a frame of each of the paper's environments")
     cars = commands.add_parser("animation", help="untrained policies in Mountain Car, a GIF")
     study.runs.add_runs(results)
-    methods = {"default": "ppo", "choices": list(METHOD_LOOK)}
-    results.add_argument("--method", **methods, help="which method's runs (default: ppo)")
+    results.add_argument("--method", default="ppo", choices=["ppo", "trpo", "a2c"])
     noise.add_argument("--beta", nargs="+", type=float, default=BETAS, help="default: the study's")
     cars.add_argument("--beta", nargs="+", type=float, default=[0.0, 0.5, 1.0])
-    for command, default, what in (
-        (noise, "figures", "folder for figures"),
-        (results, "figures", "folder for figures and tables; replaces those of earlier runs"),
-        (sheet, "results/environments.png", "the picture's file"),
-        (cars, "results/animation.gif", "the picture's file"),
-    ):
-        command.add_argument("--out", type=Path, default=Path(default), help=what)
+    folder = {"type": Path, "default": Path("figures"), "help": "folder; replaces earlier figures"}
+    noise.add_argument("--out", **folder)
+    results.add_argument("--out", **folder)
+    sheet.add_argument("--out", type=Path, default=Path("results/environments.png"))
+    cars.add_argument("--out", type=Path, default=Path("results/animation.gif"))
     return parser.parse_args()
 
 
@@ -760,7 +688,6 @@ def main():
     if args.command == "results":
         draw_results(args)
     elif args.command == "noise":
-        args.out.mkdir(parents=True, exist_ok=True)
         made, _ = make_all(noise(sorted(set(args.beta))), args.out)
         print(f"{args.out}: {', '.join(made)}")
     elif args.command == "environments":

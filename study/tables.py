@@ -19,15 +19,7 @@ from study.runs import (
     need,
     published,
 )
-from study.statistics import (
-    cells_intervals,
-    improvement,
-    iqm,
-    mean_intervals,
-    standardize,
-    stratified,
-    welch,
-)
+from study.statistics import FEW, cells_intervals, mean_intervals, standardize, welch
 
 
 def best_beta_per_env(runs):
@@ -112,6 +104,31 @@ def performance_grid(runs):
     return cells.groupby(["beta", "n_envs"]).mean().unstack(), runs
 
 
+def rank_grids(runs):
+    """Performance by beta and n_envs, its ranks, and ranks projected from the bias of the noise.
+
+    Projected by our best betas and, where the runs have the study's protocol, by the paper's.
+    Returns `performance_grid`'s grid, {title: grid of ranks, 1 the best}, projections that are the
+    same once, and the runs that all is made of.
+    """
+    need(runs.beta.nunique() > 1, "at least two betas")
+    grid, runs = performance_grid(runs)
+    lengths = runs.noise_seq_len.unique()
+    need(len(lengths) == 1, "one --noise-seq-len, of all environments: the projection goes by it")
+    best = {"our": grid.idxmax()}
+    if not differences(runs).any():
+        best["the paper's"] = published("best_beta_per_n_envs").set_index("n_envs").best_beta
+    projected = {}
+    for whose, betas in best.items():
+        ranks = projected_ranks(betas, grid.index, grid.columns, int(lengths[0]))
+        projected[whose] = ranks.where(grid.notna())
+    if len(best) > 1 and projected["our"].equals(projected["the paper's"]):
+        projected = {"our and the paper's": projected["our"]}
+    titles = [f"rank projected from the bias,\nby {whose} best $\\beta$" for whose in projected]
+    ranks = {"rank of performance within n_envs": (-grid).rank()}
+    return grid, ranks | dict(zip(titles, projected.values(), strict=True)), runs
+
+
 def projected_ranks(best, betas, n_envs, seq_len=1000):
     """Ranks of the betas for each n_envs as projected from the bias of the noise, 1 the best.
 
@@ -166,14 +183,15 @@ def final_return_per_beta(table):
     """The table of `final_returns` for readers, a row per environment and n_envs, rounded.
 
     Columns of each beta: "mean [low, high]" and the published mean, "(outside)" where our interval
-    does not hold it.
+    of FEW seeds or more does not hold it.
     """
     rows = []
     for key, cells in table.groupby(CELL):
         row = dict(zip(CELL, key, strict=True)) | {"runs": cells.runs.sum()}
         for cell in cells.to_dict("records"):
             interval = "" if pd.isna(cell["low"]) else " [{low:z.1f}, {high:z.1f}]".format(**cell)
-            outside = " (outside)" if cell["in_interval"] == "no" else ""
+            missed = cell["in_interval"] == "no" and cell["runs"] >= FEW
+            outside = " (outside)" if missed else ""
             paper = "" if pd.isna(cell["paper"]) else f"{cell['paper']:z.1f}{outside}"
             row[f"beta {cell['beta']}"] = f"{cell['mean']:z.1f}{interval}"
             row[f"paper, {cell['beta']}"] = paper
@@ -218,30 +236,10 @@ def average_final_returns(runs):
     return pd.concat(tables, ignore_index=True)
 
 
-def robust_statistics(runs):
-    """Beyond the paper, because seeds are few (Agarwal et al. 2021), per beta, with intervals:
-
-    - `iqm`: interquartile mean of the standardized performance, its mean without the lowest and the
-      highest quarter, cells weighing the same;
-    - `improvement`: probability that a run does better than one with beta 0, averaged over cells.
-
-    Cells are the environments and n_envs that have all betas. The 95 % bootstrap is stratified:
-    runs are drawn within each cell, where there are five or more in all.
-    """
-    runs = comparable(runs, ["beta"], CELL)
-    groups = runs.assign(z=standardize(runs)).groupby(["beta", *CELL]).z
-    cells, rows = {key: z.to_numpy() for key, z in groups}, []
-    for beta in sorted(runs.beta.unique()):
-        ours = {key[1:]: z for key, z in cells.items() if key[0] == beta}
-        both = [key for key in ours if beta != 0 and (0, *key) in cells]
-        pairs = [ours[key] for key in both] + [cells[0, *key] for key in both]
-        row = {"beta": beta, "runs": sum(map(len, ours.values())), "cells": len(ours)}
-        for statistic, samples in ((iqm, list(ours.values())), (improvement, pairs)):
-            name = statistic.__name__
-            columns = [name, f"{name}_low", f"{name}_high"]
-            row |= dict(zip(columns, stratified(samples, statistic), strict=True))
-        rows.append(row)
-    return pd.DataFrame(rows)
+def markdown(table):
+    """A table of texts in Markdown."""
+    rows = [table.columns, ["---"] * table.shape[1], *table.to_numpy()]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def save_table(table, out, name):
@@ -257,11 +255,10 @@ def save_table(table, out, name):
 
     columns = {column: [text(column, x) for x in table[column].tolist()] for column in table}
     shown = pd.DataFrame(columns)
-    rows = [shown.columns, ["---"] * shown.shape[1], *shown.to_numpy()]
     long = [shown[column].map(len).max() > 40 for column in shown]
     how = {"escape": True, "longtable": True}
     how["column_format"] = "".join("p{5cm}" if each else "l" for each in long)
     latex = shown.to_latex(index=False, **how).replace("<", "$<$")
     table.to_csv(out / f"{name}.csv", index=False)
-    (out / f"{name}.md").write_text("".join(f"| {' | '.join(row)} |\n" for row in rows))
+    (out / f"{name}.md").write_text(markdown(shown))
     (out / f"{name}.tex").write_text(latex)

@@ -1,31 +1,23 @@
 """plot.py: figures show the numbers of the runs; what cannot be made has a reason."""
 
 import argparse
-import importlib
 import sys
+import types
 from pathlib import Path
 
 import gymnasium as gym
-import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from PIL import Image
 
 import plot
 import ppo_colored_continuous as ppo
-from colored_noise import (
-    ColoredNoiseProcess,
-    autocovariance,
-    colored_noise,
-    expected_psd,
-    mean_std,
-)
+from colored_noise import ColoredNoiseProcess, autocovariance, expected_psd, mean_std
 from study import claims, tables
 from study.protocol import BETAS, COMPLEX, N_ENVS, NAMES, SETTINGS
-from study.runs import Unusable
+from study.runs import CELL, Unusable
 from study.statistics import cells_interval, mean_interval
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -36,6 +28,11 @@ NOISE = {"noise_random_walks", "noise_psd", "noise_two_step", "noise_marginal", 
 PAPERS_BEST = {1: 0.2, 2: 0.5, 4: 0.5, 8: 0.75, 16: 0.75, 32: 0.75, 64: 0.5, 128: 2.0}  # Sec. A2
 CURVES = {f"learning_curves_{of}" for of in ("n_envs_1", "n_envs_2", "n_envs_4")}
 CURVES |= {f"learning_curves_{of}" for of in ("mountain_car", "pendulum_swingup", "point_push")}
+FOUND = {"where": "Fig. 3", "says": "it is so", "verdict": "holds", "data": "0.2", "mean": 0.2}
+FOUND |= {"low": 0.1, "high": 0.3, "least": 0.0, "most": np.inf, "unit": "deviations", "runs": "3"}
+NO_NUMBER = FOUND | {"mean": np.nan, "low": np.nan, "high": np.nan}
+COVERAGE = [FOUND, FOUND | {"verdict": "open", "unit": "share of runs", "most": 0.1}]
+COVERAGE += [NO_NUMBER | {"data": "in 3 of 4"}, NO_NUMBER | {"verdict": "open", "data": "no runs"}]
 
 
 def made_up(level, envs=(PENDULUM,), betas=(0, 0.5, 1), n_envs=(4,), seeds=2, **other):
@@ -43,15 +40,13 @@ def made_up(level, envs=(PENDULUM,), betas=(0, 0.5, 1), n_envs=(4,), seeds=2, **
 
     A beta of NaN stands for vanilla PPO.
     """
-    rng, rows = np.random.default_rng(0), []
-    axes = [(e, b, n, s) for e in envs for b in betas for n in n_envs for s in range(seeds)]
-    for env_id, beta, n, seed in axes:
-        performance = level(env_id, beta, n) + 0.3 * rng.normal()
-        row = SETTINGS | {"env_id": env_id, "environment": NAMES[env_id], "beta": float(beta)}
-        row |= {"vanilla": np.isnan(beta), "n_envs": n, "seed": seed}
-        row |= {"bootstrap_timeouts": not env_id.startswith("dm_control/")}
-        rows.append(row | {"performance": performance, "final_return": performance + 1} | other)
-    return pd.DataFrame(rows)
+    axes = {"env_id": envs, "beta": map(float, betas), "n_envs": n_envs, "seed": range(seeds)}
+    runs = pd.MultiIndex.from_product(axes.values(), names=axes).to_frame(index=False)
+    levels = [level(*each) for each in zip(runs.env_id, runs.beta, runs.n_envs, strict=True)]
+    runs["performance"] = levels + 0.3 * np.random.default_rng(0).normal(size=len(runs))
+    settings = SETTINGS | {"environment": runs.env_id.map(NAMES), "vanilla": runs.beta.isna()}
+    settings |= {"bootstrap_timeouts": ~runs.env_id.str.startswith("dm_control/")} | other
+    return runs.assign(final_return=runs.performance + 1, **settings)
 
 
 def made_up_curves(runs):
@@ -71,6 +66,10 @@ def z_scores(runs):
 
 def level(env_id, beta, n_envs):
     return (-1 if env_id == CAR else 3) * np.nan_to_num(beta) + n_envs
+
+
+def texts(artists):
+    return [artist.get_text() for artist in artists]
 
 
 @pytest.fixture(scope="module")
@@ -94,16 +93,18 @@ def closed_figures():
 
 def check_labels(fig):
     """Panels are labelled and not empty. No labels are nearer than 2 points, no titles touch."""
+    fig.set_dpi(60)
+    fig.canvas.draw()
     assert all(ax.has_data() and (ax.get_xlabel() or ax.get_title()) for ax in fig.axes)
-    assert any(ax.get_xlabel() for ax in fig.axes) and any(ax.get_ylabel() for ax in fig.axes)
+    assert any(ax.get_xlabel() for ax in fig.axes)
     groups = [[ax.title for ax in fig.axes]]
     for ax in fig.axes:
         for axis in (ax.xaxis, ax.yaxis):
             (low, high), labels = sorted(axis.get_view_interval()), axis.get_ticklabels()
             groups += [[t for t in labels if low <= t.get_position()[axis is ax.yaxis] <= high]]
     renderer = fig.canvas.get_renderer()
-    for texts in groups:
-        boxes = [text.get_window_extent(renderer) for text in texts if text.get_text()]
+    for group in groups:
+        boxes = [text.get_window_extent(renderer) for text in group if text.get_text()]
         boxes = [box.padded(fig.dpi / 72) for box in boxes]
         assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
@@ -114,7 +115,6 @@ def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path, whole_study)
 
     def save(fig, path, dpi=None):  # writing files would take most of the time
         if path.suffix == ".png":
-            fig.canvas.draw()
             check_labels(fig)
             pixels = np.asarray(fig.canvas.buffer_rgba())
             assert (pixels[:, :, :3].mean(2) < 200).mean() > 0.002, f"{path.stem} is blank"
@@ -126,17 +126,19 @@ def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path, whole_study)
     known = {*todo, *NOISE, "", "learning_curves_n_envs_*", "results/environments.png"}
     for name in CURVES - {"learning_curves_n_envs_4", "learning_curves_mountain_car"}:
         del todo[name]
-    few = made_up(level)  # of all runs, the claims take long
-    todo["coverage"] = (claims.coverage, {"ppo": few}, made_up_curves(few))
+    # Eight betas and eight n_envs: axes as full as the study fills them
+    full = made_up(level, [PENDULUM], BETAS, N_ENVS, seeds=1)
+    todo |= {"all betas": (plot.compare, full, "beta", CELL), "all": (plot.n_envs_beta_grids, full)}
+    todo["coverage"] = (pd.DataFrame, COVERAGE)
     made, not_made = plot.make_all(todo, tmp_path)
     assert set(made) == set(todo) and not_made == []
-    assert len(set(pictures.values())) == len(pictures) == len(todo) - 8
+    assert len(set(pictures.values())) == len(pictures) == len(todo) - 7
     for name in set(made) - set(pictures):
         rows = (tmp_path / f"{name}.md").read_text().splitlines()
         assert len(rows) == len(pd.read_csv(tmp_path / f"{name}.csv")) + 2
         assert (tmp_path / f"{name}.tex").exists()
     # The table of the paper's claims names figures and tables that are made
-    assert set(made["coverage"].file.fillna("")) <= known
+    assert {claim[3] for claim in claims.CLAIMS} <= known
 
 
 def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path, whole_study):
@@ -148,28 +150,13 @@ def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path, whole_study):
     made, not_made = plot.make_all(todo, tmp_path)
     reasons = dict(line.split(": needs ") for line in not_made)
     assert set(made) | set(reasons) == set(todo) and not set(made) & set(reasons)
-    assert {"final_returns", "final_return_vs_n_envs", "learning_curves_n_envs_4"} <= set(made)
+    assert {"final_returns", "learning_curves_n_envs_4"} <= set(made)
     assert reasons["performance_vs_beta"] == "at least two values of beta"
-    assert {"beta0_vs_vanilla", "n_epochs_vs_beta", "transfer", "gsde_vs_beta"} <= set(reasons)
+    assert reasons["transfer"] == "at least two values of method"
+    assert reasons["claims"] == "the table coverage"
     todo = plot.results({"ppo": runs[runs.vanilla]}, curves, [])
     del todo["coverage"]
-    made, not_made = plot.make_all(todo, tmp_path)
-    assert list(made) == ["final_returns", "final_return_per_beta"]
-    assert "robust_performance: needs the table robust_statistics" in not_made
-
-
-def test_labels_of_the_whole_grid_do_not_touch():
-    """Eight betas and eight n_envs: the axes as full as the study fills them."""
-    runs = made_up(level, [PENDULUM], BETAS, N_ENVS, seeds=1)
-    todo = plot.results({"ppo": runs}, None, [0, 0.5, 1])
-    made = {"final_returns": tables.final_returns(runs)}
-    made["average_final_returns"] = tables.average_final_returns(runs)
-    names = ["performance_vs_beta", "n_envs_beta_grids", "final_return_vs_n_envs"]
-    for name in [*names, "beside_published"]:
-        make, data, *rest = todo[name]
-        fig = make(made[data] if isinstance(data, str) else data, *rest)
-        fig.canvas.draw()
-        check_labels(fig)
+    assert list(plot.make_all(todo, tmp_path)[0]) == ["final_returns", "final_return_per_beta"]
 
 
 def test_averages_are_of_comparable_cells_and_say_of_which():
@@ -178,7 +165,8 @@ def test_averages_are_of_comparable_cells_and_say_of_which():
         made_up(lambda _, beta, n: -beta, [CAR], seeds=5),
     )
     ax = plot.compare(runs, "beta", ["environment", "n_envs"]).axes[0]
-    assert ax.get_title() == "2 environments, n_envs 4, 32 (3 cells), 45 runs"
+    made_of = "n_envs 4 in 1 environment; n_envs 4, 32 in 1 environment; 45 runs"
+    assert ax.get_title().replace("\n", " ") == made_of
     cells = z_scores(runs).groupby([runs.beta, runs.environment, runs.n_envs])
     expected = cells.mean().groupby("beta").mean()
     assert list(ax.lines[0].get_xdata()) == [0, 0.5, 1]
@@ -188,44 +176,41 @@ def test_averages_are_of_comparable_cells_and_say_of_which():
     assert bar.ravel() == pytest.approx([0.5, low, 0.5, high])
     # Mountain Car lacks n_envs 32, so that an average over n_envs is without it
     ax = plot.compare(runs, "n_envs", ["environment", "beta"]).axes[0]
-    title = "1 environment, n_envs 4, 32, 30 runs\n"
-    assert ax.get_title() == f"{title}(without 15 runs that lack a counterpart or a second seed)"
+    left_out = "(without 15 runs that lack a counterpart or a second seed)"
+    assert ax.get_title() == f"n_envs 4, 32 in 1 environment; 30 runs\n{left_out}"
     pendulum = runs[runs.env_id == PENDULUM]
     expected = z_scores(pendulum).groupby(pendulum.n_envs).mean()
     assert ax.lines[0].get_ydata() == pytest.approx(expected.to_numpy())
-    one = plot.compare(runs[runs.seed == 1], "beta", ["environment", "n_envs"]).axes[0]
-    assert one.get_title().endswith("\n(no interval where a cell has one run)")
 
 
 def check_lines(fig, runs, by, x):
     """A line per value of `by`, of the means over x of these runs, which are of one environment."""
-    lines = [line for line in fig.axes[0].lines if len(line.get_xdata()) > 1]
+    lines = fig.axes[0].lines
     expected = z_scores(runs).groupby([runs[by], runs[x]]).mean()
     values = expected.index.unique(by)
     assert len(lines) == len(values) > 1
-    for line, value in zip(lines, values, strict=True):
+    for line, key, value in zip(lines, fig.legends[0].get_lines(), values, strict=True):
         assert line.get_ydata() == pytest.approx(expected[value].to_numpy())
         # Lines stand beside each other, so that their intervals can be seen
         assert line.get_xdata() == pytest.approx(list(expected[value].index), rel=0.1, abs=0.1)
+        assert key.get_marker() == line.get_marker() and key.get_color() == line.get_color()
 
 
-def test_vanilla_beside_beta_0():
+def drawn(name, runs):
+    make, *arguments = plot.results({"ppo": runs}, made_up_curves(runs), [])[name]
+    return make(*arguments)
+
+
+def test_a_line_per_algorithm_n_steps_and_n_epochs():
     runs = made_up(level, [CAR], [0, 0.5, np.nan], [1, 4])
-    check_lines(plot.beta0_vs_vanilla(runs), runs[runs.beta != 0.5], "vanilla", "n_envs")
-
-
-def test_n_steps_by_the_size_of_an_update():
+    check_lines(drawn("beta0_vs_vanilla", runs), runs[runs.beta != 0.5], "vanilla", "n_envs")
     sizes = [(1, 4096), (2, 4096), (2, 2048), (4, 2048)]
-    parts = [made_up(level, betas=[0.2, 0.5], n_envs=[n], n_steps=steps) for n, steps in sizes]
-    runs = together(*parts)
+    runs = together(*(made_up(level, betas=[0.2, 0.5], n_envs=[n], n_steps=t) for n, t in sizes))
     shown = runs[runs.beta == 0.5].assign(size=runs.n_envs * runs.n_steps)
-    check_lines(plot.n_envs_vs_n_steps(runs), shown, "n_steps", "size")
-
-
-def test_n_epochs_by_beta():
+    check_lines(drawn("n_envs_vs_n_steps", runs), shown, "n_steps", "size")
     parts = [made_up(lambda _, beta, n, e=e: beta * e, n_epochs=e) for e in (10, 20)]
-    runs = together(*parts, made_up(level, betas=[2]))  # of this beta there is one n_epochs only
-    check_lines(plot.n_epochs_vs_beta(runs), runs[runs.beta < 2], "n_epochs", "beta")
+    runs = together(*parts, made_up(level, betas=[2]))  # of this beta only one n_epochs
+    check_lines(drawn("n_epochs_vs_beta", runs), runs[runs.beta < 2], "n_epochs", "beta")
 
 
 def test_grids_show_performance_and_ranks_within_each_n_envs():
@@ -239,100 +224,101 @@ def test_grids_show_performance_and_ranks_within_each_n_envs():
     for ax in plot.n_envs_beta_grids(runs).axes:
         places = [dots.get_offsets()[0].tolist() for dots in ax.collections]
         assert places == [[0, 0], [0, 1], [0, 2], [1, 1], [1, 2]]  # none at n_envs 32, beta 0
-        assert [text.get_text() for text in ax.get_yticklabels()] == ["0", "0.5", "1"]
+        assert texts(ax.get_yticklabels()) == ["0", "0.5", "1"]
         sizes += [[(dots.get_sizes()[0] - 8) / 200 for dots in ax.collections]]
-    performance, ranks, by_ours, by_the_papers = sizes
+    performance, ranks, projected = sizes  # the projections by our and by the paper's best agree
     assert performance == pytest.approx((share**6).tolist())
     assert ranks == pytest.approx([0, 1, 0.5, 0, 1])
-    for size, best in ((by_ours, {4: 0.5, 32: 1}), (by_the_papers, PAPERS_BEST)):
+    for best in ({4: 0.5, 32: 1}, PAPERS_BEST):
         order = tables.projected_ranks(pd.Series(best), [0, 0.5, 1], [4, 32])
         expected = [*(3 - order[4]) / 2, *(order[32].iloc[1:].rank(ascending=False) - 1)]
-        assert size == pytest.approx(expected)
+        assert projected == pytest.approx(expected)
+    runs.loc[runs.beta == 0, "performance"] += 90  # best now, with n_envs 4
+    titles = [ax.get_title() for ax in plot.n_envs_beta_grids(runs).axes]
+    assert "by our best" in titles[2] and "by the paper's best" in titles[3]
     runs.loc[runs.n_envs == 32, "noise_seq_len"] = 500
     with pytest.raises(Unusable, match="one --noise-seq-len"):
         plot.n_envs_beta_grids(runs)
 
 
 def test_learning_curves_are_means_over_seeds_beside_the_published_end():
-    runs = made_up(lambda *_: 300, betas=[0, 0.5], seeds=4)
+    """Of five seeds the band is their interval; fewer are drawn one by one."""
+    runs = made_up(lambda *_: 300, betas=[0, 0.5], seeds=5)
+    runs = runs[(runs.beta == 0) | (runs.seed < 2)]
     curves = made_up_curves(runs)
-    ax = plot.learning_curves(runs, curves, "environment").axes[0]
-    assert ax.get_title() == "Pendulum Swingup, n_envs 4"
-    lines = [line for line in ax.lines if len(line.get_xdata()) == 5]
-    for line, band, beta in zip(lines, ax.collections, [0, 0.5], strict=True):
-        expected = curves[runs.beta == beta]
-        assert line.get_ydata() == pytest.approx(expected.mean().to_numpy())
-        _, low, high = mean_interval(expected, n_resamples=1000)
-        heights = band.get_paths()[0].vertices[:, 1]
-        assert (heights.min(), heights.max()) == pytest.approx((low.min(), high.max()))
+    fig = plot.learning_curves(runs, curves, "environment")
+    [ax] = fig.axes
+    assert ax.get_title() == "Pendulum Swingup\nn_envs 4, 2 or 5 seeds"
+    lines = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 5]
+    white, half = (curves[runs.beta == beta] for beta in (0, 0.5))
+    np.testing.assert_allclose(lines, [white.mean(), half.mean(), *half.to_numpy()])
+    _, low, high = mean_interval(white, n_resamples=1000)
+    heights = ax.collections[0].get_paths()[0].vertices[:, 1]
+    assert (heights.min(), heights.max()) == pytest.approx((low.min(), high.max()))
     ends = [line.get_ydata()[0] for line in ax.lines if len(line.get_xdata()) == 1]
     assert ends == [677.5, 694.6]  # the paper's table of Sec. A14
+    keys = texts(fig.legends[0].get_texts())[2:]
+    assert keys == ["paper", "95 % BCa interval", "runs, if fewer than 5"]
     ax = plot.learning_curves(runs.assign(gamma=0.9), curves, "environment").axes[0]
     assert not [line for line in ax.lines if len(line.get_xdata()) == 1]
-
-
-def test_three_betas_have_learning_curves():
-    for there, chosen in ((BETAS, [0, 0.5, 1]), ([-1, 0.2, 0.5, 2], [-1, 0.2, 0.5])):
-        assert plot.three_betas(pd.DataFrame({"beta": there})) == chosen
+    two = made_up(lambda _, beta, n: n, n_envs=[1, 32])
+    one, many = plot.learning_curves(two, made_up_curves(two), "n_envs").axes
+    assert one.get_ylim() == many.get_ylim()
 
 
 def test_final_returns_stand_beside_the_published():
     runs = made_up(lambda *_: 300, n_envs=[1, 4])
-    fig = plot.beside_published(tables.average_final_returns(runs), runs)
-    scatter, one, four = fig.axes
+    scatter, one, four = plot.beside_published(tables.average_final_returns(runs), runs).axes
     ours = runs.groupby(["beta", "n_envs"]).final_return.mean()
     x, y = scatter.lines[2].get_data()  # after the diagonal and beta 0
     np.testing.assert_allclose(x, [(521.1 - 1.1) / 765.8, (694.6 - 1.1) / 765.8])
     np.testing.assert_allclose(y, (ours[0.5] - 1.1) / 765.8)
     assert one.get_title() == "n_envs 1, 1 environment" and four.get_title().startswith("n_envs 4")
     assert four.lines[0].get_ydata()[2] == pytest.approx((403.1 - 1.1) / 765.8)
-    # The same on the scale of the environment, over n_envs: paper and ours of each beta
-    ax = plot.final_return_vs_n_envs(tables.final_returns(runs), [0.5]).axes[0]
-    paper, mean = ax.lines
-    assert paper.get_ydata().tolist() == [521.1, 694.6]
-    assert mean.get_ydata() == pytest.approx(ours[0.5].to_numpy())
+    assert scatter.get_ylim() == four.get_ylim() and scatter.get_title() == "6 cells"
+
+
+def test_verdicts_show_the_interval_and_where_it_must_lie():
+    fig = plot.verdicts(pd.DataFrame(COVERAGE))
+    above, below = fig.axes
+    assert texts(above.get_yticklabels()) == ["Fig. 3: it is so"] * 2
+    assert texts(above.texts) == ["holds", "in 3 of 4", "holds"] and texts(below.texts) == ["open"]
+    assert [list(line.get_xdata()) for line in above.lines] == [[0.1, 0.3], [0.2]]
+    ends = [ax.collections[0].get_paths()[0].get_extents().intervalx for ax in (above, below)]
+    assert ends[0].tolist() == [0, above.get_xlim()[1]] and ends[1][1] == 0.1
+    assert "1 more" in fig.get_suptitle()
+    with pytest.raises(Unusable, match="runs of a claim"):
+        plot.verdicts(pd.DataFrame(COVERAGE[-1:]))
 
 
 def test_other_methods_beside_ppo():
-    """Panels of TRPO and A2C are standardized by themselves, the third over all methods."""
+    """All are standardized together, at the betas that all have."""
     parts = [
         made_up(lambda _, beta, n, i=i: 10 * i + beta, [CAR], method=method)
         for i, method in enumerate(("ppo", "trpo", "a2c"))
     ]
     runs = together(*parts)
-    trpo, a2c, overall = plot.transfer(runs).axes
-    for ax, part in ((trpo, parts[1]), (a2c, parts[2])):
-        expected = z_scores(part).groupby(part.beta).mean()
-        assert ax.lines[0].get_ydata() == pytest.approx(expected.to_numpy())
-    assert trpo.get_title().startswith("TRPO") and a2c.get_title().startswith("A2C")
-    expected = z_scores(runs).groupby([runs.method, runs.beta]).mean()
-    for line, method in zip(overall.lines, ("a2c", "ppo", "trpo"), strict=True):
-        assert line.get_ydata() == pytest.approx(expected[method].to_numpy())
+    fig = plot.transfer(together(runs, made_up(level, [CAR], [2])))
+    check_lines(fig, runs, "method", "beta")
+    assert texts(fig.legends[0].get_texts()) == ["A2C", "PPO", "TRPO"]
     with pytest.raises(Unusable, match="same protocol"):
         plot.transfer(runs.assign(gamma=np.where(runs.method == "trpo", 0.9, 0.99)))
-    gsde = made_up(lambda *_: 3, [CAR], [np.nan], method="gsde", vanilla=False)
-    both = together(parts[0], gsde)
+    both = together(parts[0], made_up(lambda *_: 3, [CAR], [np.nan], method="gsde", vanilla=False))
     ax = plot.gsde_vs_beta(both).axes[0]
-    assert [text.get_text() for text in ax.get_xticklabels()] == ["0", "0.5", "1", "gSDE"]
+    assert texts(ax.get_xticklabels()) == ["0", "0.5", "1", "gSDE"]
     z = z_scores(both)[both.method == "gsde"].mean()
-    assert ax.lines[0].get_ydata() == pytest.approx([z, z])
-    assert ax.lines[-1].get_ydata() == pytest.approx([z])
+    assert [*ax.lines[0].get_ydata(), *ax.lines[-1].get_ydata()] == pytest.approx([z] * 3)
 
 
 def test_complex_tasks_have_a_panel_each():
-    """A task with one seed is drawn beside one with two, and has no interval."""
-    runs = together(
-        made_up(lambda _, beta, n: beta, [POINT], seeds=2),
-        made_up(lambda _, beta, n: -beta, [ANT], seeds=1),
-        made_up(level),
-    )
-    fig = plot.complex_tasks(runs)
-    titles = [ax.get_title() for ax in fig.axes]
-    assert titles == ["Ant Push\n(one run each: no interval)", "Point Push"]
-    for ax, env_id in zip(fig.axes, (ANT, POINT), strict=True):
-        means = runs[runs.env_id == env_id].groupby("beta").performance.mean()
+    """A task with one seed is drawn beside one with two. Small differences do not look large."""
+    tasks = made_up(lambda _, beta, n: beta, [POINT]), made_up(lambda *_: 0.5, [ANT], seeds=1)
+    fig = plot.complex_tasks(together(*tasks, made_up(level)))
+    assert [ax.get_title() for ax in fig.axes] == ["Ant Push", "Point Push"]
+    for ax, runs in zip(fig.axes, tasks[::-1], strict=True):
+        means = runs.groupby("beta").performance.mean()
         assert ax.lines[0].get_ydata() == pytest.approx(means.to_numpy())
-    assert "without" not in fig.get_suptitle()
+        assert ax.get_ylim()[0] < 0 and ax.get_ylim()[1] > 1
 
 
 def test_noise_is_beside_its_closed_forms():
@@ -340,7 +326,6 @@ def test_noise_is_beside_its_closed_forms():
     figures = {name: make(list(data)) for name, (make, data) in plot.noise([0, 0.5, 1]).items()}
     assert set(figures) == NOISE
     for fig in figures.values():
-        fig.canvas.draw()
         check_labels(fig)
     psd = figures["noise_psd"].axes[0].lines
     lags = autocovariance(betas, 1000)
@@ -354,14 +339,12 @@ def test_noise_is_beside_its_closed_forms():
         pairs = ax.collections[0].get_offsets().T
         assert np.corrcoef(pairs)[0, 1] == pytest.approx(correlations[i], abs=0.05)
         density = [bar.get_height() for bar in figures["noise_marginal"].axes[i].patches]
-        assert sum(density) * 0.1 == pytest.approx(1, abs=0.001)
         assert max(density) == pytest.approx(0.4, abs=0.02)
     spread = figures["noise_bias"].axes[1].lines
     expected = mean_std(betas, 1000).tolist()
     assert [line.get_ydata()[0] for line in spread[:3]] == pytest.approx(expected, rel=0.05)
     walk = figures["noise_random_walks"].axes[1].lines[0].get_ydata()
-    noise = colored_noise(0.5, (4, 2, 1000), generator=torch.Generator().manual_seed(0))
-    np.testing.assert_allclose(walk, noise[0, 1].cumsum(0), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(walk, plot.draw_noise(0.5, 4, 2)[0, 1].cumsum(0), rtol=1e-6)
 
 
 def test_the_command_replaces_earlier_figures_and_reports(monkeypatch, tmp_path, capsys):
@@ -377,15 +360,10 @@ def test_the_command_replaces_earlier_figures_and_reports(monkeypatch, tmp_path,
     files = RESULTS / "reproduction.csv", RESULTS / "methods.csv"
     first = command(*files, "--env", "MountainCarContinuous")
     assert first.startswith(f"{tmp_path}: final_returns, final_return_per_beta, transfer\n")
-    assert "of other methods, only where these are compared: 3\n  trpo: " in first
-    assert "not made: 1\n  n_epochs_vs_beta: needs at least two values of --n-epochs\n" in first
+    assert "not made: 1\n  n_epochs_vs_beta: needs at least two values of n_epochs\n" in first
     assert "of 5 published means outside our 95 % intervals" in first
-    with Image.open(tmp_path / "transfer.png") as image:
-        assert image.info["dpi"] == pytest.approx((200, 200), abs=0.1)
     pdf = (tmp_path / "transfer.pdf").read_bytes()
     assert b"/FontFile2" in pdf and b"/Type3" not in pdf  # journals refuse Type 3 fonts
-    table = pd.read_csv(tmp_path / "final_returns.csv", dtype={"beta": str}).set_index("beta")
-    assert table["mean"]["0.5"] == pytest.approx(93.9, abs=0.1)  # as in the README
     (tmp_path / "transfer_mine.png").write_text("the user's own")
     command(files[0], "--env", "pendulum-swingup", "--beta", "0", "1", "--n-envs", "4")
     names = {"final_returns", "final_return_per_beta", "report", "transfer_mine"}
@@ -400,20 +378,12 @@ def test_the_command_replaces_earlier_figures_and_reports(monkeypatch, tmp_path,
 
 def test_the_environments_picture(monkeypatch):
     """Each environment's name stands above its square picture, also where a frame is wide."""
-
-    class Env:
-        def reset(self, seed): ...
-        def close(self): ...
-        def render(self):
-            return np.full((400, 600, 3), 255, np.uint8)
-
-    ids = []
-    monkeypatch.setattr(ppo, "make_env", lambda args, render_mode: ids.append(args.env_id) or Env())
+    frame = np.zeros((400, 600, 3), np.uint8)
+    env = types.SimpleNamespace(reset=lambda seed: None, close=lambda: None, render=lambda: frame)
+    monkeypatch.setattr(ppo, "make_env", lambda args, render_mode: env)
     axes = plot.contact_sheet().axes
-    assert [ax.get_title() for ax in axes] == [NAMES[env_id] for env_id in ids]
-    assert set(ids) == set(NAMES)
-    shapes = {ax.images[0].get_array().shape for ax in axes}
-    assert shapes == {(400, 400, 3), (600, 600, 3)}
+    assert [ax.get_title() for ax in axes] == list(NAMES.values())
+    assert {ax.images[0].get_array().shape for ax in axes} == {(400, 400, 3), (600, 600, 3)}
 
 
 def test_untrained_cars_are_those_of_a_first_rollout():
@@ -430,30 +400,18 @@ def test_untrained_cars_are_those_of_a_first_rollout():
         obs = np.array([env.step(a)[0] for env, a in zip(envs, actions, strict=True)])
     there = plot.untrained_positions(1) >= 0.45
     assert (np.diff(there.astype(int), axis=0) >= 0).all()
-    assert 30 <= there[-1].sum() < 49  # 39 in the README
+    assert 30 <= there[-1].sum() < 49
 
 
-def test_the_animation(monkeypatch, tmp_path):
+def test_the_animation(monkeypatch):
     """Cars are where they are on the hill, and those at the goal are counted."""
     cars = {0: np.array([[-0.5, -0.6], [-0.4, 0.2]]), 1: np.array([[-0.5, -0.6], [0.46, 0.1]])}
     monkeypatch.setattr(plot, "untrained_positions", cars.get)
     movie = plot.animation([0, 1], n_frames=2)
-    movie.save(tmp_path / "animation.gif", plot.PillowWriter(fps=15), dpi=20)
+    movie._draw_frame(1)
     white, pink = movie._fig.axes
     assert white.get_title().endswith("(white), step 1\nat the goal: 0 of 2")
     assert pink.get_title().endswith("(pink), step 1\nat the goal: 1 of 2")
     x, y = pink.lines[-1].get_data()
     assert list(x) == [0.46, 0.1]
     assert np.array(y) - 0.45 * np.sin(3 * x) == pytest.approx([0.66, 0.66], abs=0.08)
-    with Image.open(tmp_path / "animation.gif") as gif:
-        assert gif.n_frames > 1 and gif.info["loop"] == 0  # plays on and on
-
-
-def test_a_notebook_keeps_its_backend():
-    before = matplotlib.get_backend()
-    try:
-        matplotlib.use("svg")
-        importlib.reload(plot)
-        assert matplotlib.get_backend() == "svg"
-    finally:
-        matplotlib.use(before)

@@ -7,7 +7,6 @@ from scipy import stats
 
 from study import tables
 from study.runs import Unusable, published
-from study.statistics import standardize
 
 PENDULUM, CAR = "dm_control/pendulum-swingup-v0", "MountainCarContinuous-v0"
 
@@ -23,13 +22,11 @@ def test_best_beta_per_env(made_up):
     pooled = {beta: group.performance for beta, group in two.groupby("beta")}
     row = table.loc["Pendulum Swingup"]
     assert row.best_beta == 0.5 == max(pooled, key=lambda beta: pooled[beta].mean())
-    p = {
-        beta: stats.ttest_ind(pooled[0.5], pooled[beta], equal_var=False).pvalue for beta in (0, 1)
-    }
-    assert p[1] < 0.05 and [row["p_0.0"], row["p_1.0"]] == pytest.approx([p[0], p[1]])
-    verdict = "outperformed" if p[0] < 0.05 else "comparable"
+    p = [stats.ttest_ind(pooled[0.5], pooled[b], equal_var=False).pvalue for b in (0, 1)]
+    assert p[1] < 0.05 and [row["p_0.0"], row["p_1.0"]] == pytest.approx(p)
     verdicts = row[["beta_0.5", "beta_0.0", "beta_1.0"]].tolist()
-    assert verdicts == ["comparable", verdict, "outperformed"] and np.isnan(row["p_0.5"])
+    white = "outperformed" if p[0] < 0.05 else "comparable"
+    assert verdicts == ["comparable", white, "outperformed"] and np.isnan(row["p_0.5"])
     # With one seed there is no test, so no verdict counts, not even that of the best itself
     alone = table.loc["Mountain Car", ["best_beta", "beta_0.0", "beta_0.5", "beta_1.0"]]
     assert alone.tolist() == [0, "", "", ""]
@@ -61,8 +58,6 @@ def test_averages_are_of_comparable_cells_that_weigh_the_same(made_up):
     assert runs.groupby("beta").performance.mean().idxmax() != 0.5
     row = tables.best_beta_per_env(runs).iloc[0]
     assert row[["best_beta", "beta_0.5", "runs"]].tolist() == [0.5, "comparable", 20]
-    robust = tables.robust_statistics(runs).set_index("beta")
-    assert robust.iqm.idxmax() == 0.5 and (robust.cells == 1).all() and robust.runs.sum() == 20
     assert tables.best_beta_per_n_envs(runs).best_beta.tolist() == [0.5, 0.5]
     grid, shown = tables.performance_grid(runs)
     assert len(shown) == 24 and grid.notna().sum().tolist() == [4, 2]
@@ -75,23 +70,21 @@ def test_averages_are_of_comparable_cells_that_weigh_the_same(made_up):
 def test_final_return_tables(tmp_path, write_run, selected, short_study):
     short_study(2)
     # Published for this cell is 677.5, a rounded number, which an interval of 677.54 still holds
-    for seed in (1, 2):
+    for seed in range(1, 6):
         write_run(tmp_path, PENDULUM, 0, 4, seed, [0.0, 677.54])
         write_run(tmp_path, PENDULUM, 0.5, 4, seed, [1.0, 694.66])  # published: 694.6
+    for seed in (1, 2):
         write_run(tmp_path, PENDULUM, "vanilla", 4, seed, [2.0, 3.0])
-    write_run(tmp_path, PENDULUM, 1, 4, 1, [0.0, 403.1])  # one seed: no interval
+    write_run(tmp_path, PENDULUM, 1, 4, 1, [0.0, 403.1])
     runs = selected(tmp_path)
     table = tables.final_returns(runs).set_index("beta")
     assert table["mean"].to_dict() == {"0": 677.54, "0.5": 694.66, "vanilla": 3, "1": 403.1}
     assert table.paper.to_dict() == {"0": 677.5, "0.5": 694.6, "vanilla": 733.1, "1": 403.1}
-    inside = {"0": "yes", "0.5": "no", "vanilla": "no", "1": ""}
-    assert table.in_interval.fillna("").to_dict() == inside
+    assert table.in_interval.to_dict() == {"0": "yes", "0.5": "no", "vanilla": "no", "1": "yes"}
     wide = tables.final_return_per_beta(table.reset_index())
-    titles = "environment n_envs runs beta 0 paper, 0 beta 0.5 paper, 0.5 beta 1 paper, 1"
-    assert " ".join(wide) == f"{titles} beta vanilla paper, vanilla"
-    assert wide.iloc[0].tolist() == [
-        *("Pendulum Swingup", 4, 7, "677.5 [677.5, 677.5]", "677.5", "694.7 [694.7, 694.7]"),
-        *("694.6 (outside)", "403.1", "403.1", "3.0 [3.0, 3.0]", "733.1 (outside)"),
+    assert wide.iloc[0].tolist() == [  # outside is said of five seeds and more only
+        *("Pendulum Swingup", 4, 13, "677.5 [677.5, 677.5]", "677.5", "694.7 [694.7, 694.7]"),
+        *("694.6 (outside)", "403.1 [403.1, 403.1]", "403.1", "3.0 [3.0, 3.0]", "733.1"),
     ]
     summary = tables.final_return_and_performance(runs[~runs.vanilla]).iloc[0]
     assert summary.final_return_mean == pytest.approx((677.54 + 694.66 + 403.1) / 3)
@@ -120,12 +113,9 @@ def test_final_returns_on_the_published_scale(made_up):
     off = np.where(runs.env_id == CAR, 0, 20.0 * runs.seed - 10)
     keys = zip(runs.env_id, runs.beta, strict=True)
     runs["final_return"] = np.array([ends[key] for key in keys]) + off
-    more = runs[(runs.env_id == CAR) & (runs.beta == 0.2) & (runs.seed == 0)]
-    more = [
-        more.assign(n_envs=32, final_return=0.0),
-        more.assign(beta=0.3),  # no such beta in the paper
-        more.assign(beta=1.0, gamma=0.9),  # not its settings
-    ]
+    one = runs[(runs.env_id == CAR) & (runs.beta == 0.2) & (runs.seed == 0)]
+    other = one.assign(beta=1.0, gamma=0.9)  # not the paper's settings, and no beta of it:
+    more = [one.assign(n_envs=32, final_return=0.0), one.assign(beta=0.3), other]
     table = tables.average_final_returns(pd.concat([runs, *more], ignore_index=True))
     columns = table[["n_envs", "beta", "runs", "environments"]]
     assert columns.to_numpy().tolist() == [[4, 0, 4, 2], [4, 0.2, 4, 2], [32, 0.2, 1, 1]]
@@ -134,7 +124,7 @@ def test_final_returns_on_the_published_scale(made_up):
     np.testing.assert_allclose(table.paper, paper)
     assert (table.high - table.low)[:2].between(0.005, 0.02).all() and np.isnan(table.low[2])
     with pytest.raises(Unusable, match="the study's settings"):
-        tables.on_published_scale(more[2])
+        tables.on_published_scale(other)
 
 
 def test_projected_ranks_from_the_published_best_betas():
@@ -150,30 +140,11 @@ def test_projected_ranks_from_the_published_best_betas():
 
     assert [round(sigma(b), 4) for b in (0, 0.5, 1, 2)] == [0.0316, 0.1075, 0.2713, 0.5517]
     paper = published("best_beta_per_n_envs").set_index("n_envs").best_beta
-    assert paper.to_dict() == {1: 0.2, 2: 0.5, 4: 0.5, 8: 0.75, 16: 0.75, 32: 0.75, 64: 0.5, 128: 2}
     star = sum(sigma(beta) / n**0.5 for n, beta in paper.items()) / 8
     ranks = tables.projected_ranks(paper, betas, n_envs, T)
     for n in n_envs:
         E = [(star - sigma(beta) / n**0.5) ** 2 for beta in betas]
         assert ranks[n].tolist() == [1 + sum(other < e for other in E) for e in E]
-    # The trend of the paper: more environments, more correlated noise.
-    assert ranks.idxmin().tolist() == [0.2, 0.2, 0.5, 0.5, 0.75, 1, 1.25, 2]
-
-
-def test_robust_statistics(made_up):
-    levels = {0: 0.0, 0.5: 0.2, 1: 50.0}
-    runs = made_up(lambda e, beta, n: levels[beta], [PENDULUM], n_envs=(4, 8), seeds=8)
-    table = tables.robust_statistics(runs).set_index("beta")
-    z = standardize(runs)
-    assert table.iqm[0.5] == pytest.approx(stats.trim_mean(z[runs.beta == 0.5], 0.25))
-    u = []
-    for n in (4, 8):
-        x, y = (z[(runs.n_envs == n) & (runs.beta == beta)] for beta in (0.5, 0))
-        u.append(stats.mannwhitneyu(x, y).statistic / 64)
-    assert table.improvement[0.5] == pytest.approx(np.mean(u))
-    assert table.improvement_low[0.5] < table.improvement[0.5] < table.improvement_high[0.5] < 1
-    surely = table.loc[1, ["improvement", "improvement_low", "improvement_high"]]
-    assert surely.tolist() == [1, 1, 1] and np.isnan(table.improvement[0])
 
 
 def test_saved_tables(tmp_path):
