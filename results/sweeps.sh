@@ -1,6 +1,6 @@
 # shellcheck shell=bash
 # The commands of all runs in this folder, each a line of its own: copy one, and run it from the
-# repository's root. All together they take about 50 core-hours; what is complete is passed over.
+# repository's root. What is complete is passed over. Those of plans.md are here, run or not.
 
 # reproduction.csv: the paper's protocol
 ./run_sweep.sh main --runs-dir reproduction --betas "0 0.5 1" --n-envs 4 --seeds "1 2 3 4 5" --envs "MountainCarContinuous pendulum-swingup cartpole-balance_sparse cartpole-swingup_sparse ball_in_cup-catch cheetah-run reacher-hard"
@@ -10,6 +10,11 @@ python -m study.runs pack reproduction/ results/reproduction.csv --overwrite
 # study.csv: more environments and n_envs, 10 episodes instead of 50 in an evaluation
 ./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs 4 --seeds "1 2 3 4 5" --envs "hopper-hop walker-run door-v0 PointUMaze Point4Rooms SwimmerUMaze Swimmer4Rooms AntUMaze Ant4Rooms" -- --eval-episodes 10 --eval-once-per-policy
 ./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 2 3" --envs "pendulum-swingup MountainCarContinuous cartpole-balance_sparse reacher-hard cartpole-swingup_sparse cheetah-run PointUMaze Point4Rooms hopper-hop ball_in_cup-catch" -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 2" --envs "SwimmerUMaze Swimmer4Rooms walker-run ball_in_cup-catch door-v0 AntUMaze Ant4Rooms" -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas "0.5 1" --n-envs 1 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas "0.2 0.5 0.75" --n-envs 4 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas 0.2 --n-envs 4 --seeds "$(echo {401..420})" --envs MountainCarContinuous -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas 0 --n-envs 4 --seeds "$(echo {401..468})" --envs MountainCarContinuous -- --eval-episodes 10 --eval-once-per-policy
 python -m study.runs pack study_runs/ results/study.csv --overwrite
 
 # slices.csv: Sec. A6, A8, A11 and A12
@@ -59,3 +64,15 @@ python -m study.runs pack noise_length/ results/noise_length.csv --overwrite
 ./run_sweep.sh main --runs-dir new_seeds --exp-name bootstrap --n-envs "4 1" --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10 --bootstrap-timeouts
 ./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs "32 128" --betas 0 --seeds "$(echo {101..110})" --envs MountainCarContinuous -- --eval-freq 204800 --eval-episodes 10
 python -m study.runs pack new_seeds/ results/new_seeds.csv --overwrite
+
+# released_code.csv: batches and sequences as in the paper's released code
+./run_sweep.sh main --runs-dir released_code --betas 0.2 --n-envs 4 --seeds "$(echo {401..420})" --envs MountainCarContinuous -- --eval-freq 204800 --eval-episodes 10 --batch-size 64 --noise-seq-len 1024
+python -m study.runs pack released_code/ results/released_code.csv --overwrite
+
+# sb3.csv: the paper's stack on today's versions
+for SEED in {1..20}; do python -m study.sb3 --runs-dir sb3 --env-id dm_control/pendulum-swingup-v0 --vanilla --n-envs 1 --no-bootstrap-timeouts --eval-freq 204800 --eval-episodes 10 --seed "$SEED"; done
+python -m study.runs pack sb3/ results/sb3.csv --overwrite
+
+# gymnasium.csv: Gymnasium's MuJoCo tasks with the settings in use today
+./run_sweep.sh gymnasium --runs-dir gymnasium
+python -m study.runs pack gymnasium/ results/gymnasium.csv --overwrite

@@ -1,6 +1,6 @@
 """What stands in results/ is what its CSV files say."""
 
-import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from results import make
+from study import sweep
 
 RESULTS = Path(make.__file__).parent
 
@@ -46,9 +47,20 @@ def test_pictures_are_compared_by_their_pixels(tmp_path, change, same):
     assert not make.same_picture(tmp_path / "a.png", tmp_path / "none.png")
 
 
-def test_each_file_of_runs_has_its_commands():
-    """A line of results/sweeps.sh packs it."""
-    packed = re.findall(r"results/(\S+\.csv)", (RESULTS / "sweeps.sh").read_text())
-    here = {path.name for path in RESULTS.glob("*.csv")}
-    here -= {"benchmark.csv", "halfcheetah.csv", "halfcheetah_no_bootstrap.csv"}
-    assert here - {"point_with_friction.csv"} <= set(packed)
+def test_every_run_is_of_a_command():
+    """Of the lines in results/sweeps.sh between that which packs its file and the one before."""
+    listed, found = set(), {}
+    for line in (RESULTS / "sweeps.sh").read_text().splitlines():
+        if line.startswith("./run_sweep.sh"):
+            words = subprocess.run(["bash", "-c", f"printf '%s\\n' {line}"], capture_output=True)
+            args = sweep.parse_args(words.stdout.decode().splitlines()[1:])
+            listed |= {Path(folder).parts[-4:] for folder, _ in sweep.list_runs(args)}
+        elif " pack " in line:
+            found[line.split("results/")[1].split()[0]], listed = listed, set()
+    for file, listed in found.items():
+        if listed and (RESULTS / file).exists():
+            runs = {Path(path).parts[-4:] for path in make.complete(file).path}
+            assert runs and not runs - listed, file
+    others = {path.name for path in RESULTS.glob("*.csv")} - {*found}
+    others -= {"benchmark.csv", "halfcheetah.csv", "halfcheetah_no_bootstrap.csv"}
+    assert others == {"point_with_friction.csv"}  # by the same commands, as the notes say
