@@ -438,8 +438,8 @@ def verdicts(table):
         ax.set_yticks(range(len(rows)), [f"{row.where}: {row.says}" for row in rows.itertuples()])
         ax.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
         ax.grid(visible=False, axis="y")
-    title = "95 % intervals, longer where several are compared; to hold, it must lie in the gray\n"
-    fig.suptitle(f"{title}({open_ones} more claims are open for lack of runs)", fontsize=9)
+    title = "95 % intervals, longer where several are compared. A claim can hold only in the gray"
+    fig.suptitle(f"{title}\n({open_ones} more are open for lack of runs)", fontsize=9)
     return fig
 
 

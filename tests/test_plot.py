@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-import types
 from pathlib import Path
 
 import gymnasium as gym
@@ -25,9 +24,6 @@ RESULTS = Path(plot.__file__).parent / "results"
 CAR, PENDULUM = "MountainCarContinuous-v0", "dm_control/pendulum-swingup-v0"
 POINT, ANT = COMPLEX[:2]
 NOISE = {"noise_random_walks", "noise_psd", "noise_two_step", "noise_marginal", "noise_bias"}
-PAPERS_BEST = {1: 0.2, 2: 0.5, 4: 0.5, 8: 0.75, 16: 0.75, 32: 0.75, 64: 0.5, 128: 2.0}  # Sec. A2
-CURVES = {f"learning_curves_{of}" for of in ("n_envs_1", "n_envs_2", "n_envs_4")}
-CURVES |= {f"learning_curves_{of}" for of in ("mountain_car", "pendulum_swingup", "point_push")}
 FOUND = {"where": "Fig. 3", "says": "it is so", "verdict": "holds", "data": "0.2", "mean": 0.2}
 FOUND |= {"low": 0.1, "high": 0.3, "least": 0.0, "most": np.inf, "unit": "deviations", "runs": "3"}
 NO_NUMBER = FOUND | {"mean": np.nan, "low": np.nan, "high": np.nan}
@@ -72,19 +68,6 @@ def texts(artists):
     return [artist.get_text() for artist in artists]
 
 
-@pytest.fixture(scope="module")
-def whole_study():
-    """Runs of all that the study varies, {method: runs}, and their curves."""
-    both = [CAR, PENDULUM]
-    parts = [made_up(level, [*both, POINT], [0, 0.5, 1, np.nan], [1, 4])]
-    parts += [made_up(level, both, [0.5], [2], n_steps=n_steps) for n_steps in (2048, 4096)]
-    parts += [made_up(level, both, n_epochs=20)]
-    parts += [made_up(level, [CAR], method=method) for method in ("trpo", "a2c")]
-    parts += [made_up(lambda *_: 2, both, [np.nan], [1, 4], method="gsde", vanilla=False)]
-    runs = together(*parts)
-    return dict(list(runs.groupby("method", sort=False))), made_up_curves(runs)
-
-
 @pytest.fixture(autouse=True)
 def closed_figures():
     yield
@@ -96,7 +79,6 @@ def check_labels(fig):
     fig.set_dpi(60)
     fig.canvas.draw()
     assert all(ax.has_data() and (ax.get_xlabel() or ax.get_title()) for ax in fig.axes)
-    assert any(ax.get_xlabel() for ax in fig.axes)
     groups = [[ax.title for ax in fig.axes]]
     for ax in fig.axes:
         for axis in (ax.xaxis, ax.yaxis):
@@ -109,23 +91,29 @@ def check_labels(fig):
         assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
-def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path, whole_study):
-    """Each figure is labelled, not blank, and no copy of another; each table is in three files."""
-    pictures = {}
+def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path):
+    """Of runs of all that the study varies: each figure is labelled, and no copy of another."""
+    both = [CAR, PENDULUM]
+    parts = [made_up(level, [*both, POINT], [0, 0.5, 1, np.nan], [1, 4])]
+    parts += [made_up(level, both, [0.5], [2], n_steps=n_steps) for n_steps in (2048, 4096)]
+    parts += [made_up(level, both, n_epochs=20)]
+    parts += [made_up(level, [CAR], method=method) for method in ("trpo", "a2c")]
+    parts += [made_up(lambda *_: 2, both, [np.nan], [1, 4], method="gsde", vanilla=False)]
+    runs, pictures = together(*parts), {}
 
     def save(fig, path, dpi=None):  # writing files would take most of the time
         if path.suffix == ".png":
             check_labels(fig)
-            pixels = np.asarray(fig.canvas.buffer_rgba())
-            assert (pixels[:, :, :3].mean(2) < 200).mean() > 0.002, f"{path.stem} is blank"
-            pictures[path.stem] = pixels.tobytes()
+            pictures[path.stem] = bytes(fig.canvas.buffer_rgba())
 
     monkeypatch.setattr(plt.Figure, "savefig", save)
-    todo = plot.results(*whole_study, [0, 0.5, 1])
-    assert {name for name in todo if "curves" in name} == CURVES
+    methods = dict(list(runs.groupby("method", sort=False)))
+    todo = plot.results(methods, made_up_curves(runs), [0, 0.5, 1])
     known = {*todo, *NOISE, "", "learning_curves_n_envs_*", "results/environments.png"}
-    for name in CURVES - {"learning_curves_n_envs_4", "learning_curves_mountain_car"}:
-        del todo[name]
+    # The table of the paper's claims names figures and tables that are made
+    assert {claim[3] for claim in claims.CLAIMS} <= known
+    for of in ("n_envs_1", "n_envs_2", "pendulum_swingup", "point_push"):
+        del todo[f"learning_curves_{of}"]
     # Eight betas and eight n_envs: axes as full as the study fills them
     full = made_up(level, [PENDULUM], BETAS, N_ENVS, seeds=1)
     todo |= {"all betas": (plot.compare, full, "beta", CELL), "all": (plot.n_envs_beta_grids, full)}
@@ -133,19 +121,15 @@ def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path, whole_study)
     made, not_made = plot.make_all(todo, tmp_path)
     assert set(made) == set(todo) and not_made == []
     assert len(set(pictures.values())) == len(pictures) == len(todo) - 7
-    for name in set(made) - set(pictures):
-        rows = (tmp_path / f"{name}.md").read_text().splitlines()
-        assert len(rows) == len(pd.read_csv(tmp_path / f"{name}.csv")) + 2
-        assert (tmp_path / f"{name}.tex").exists()
-    # The table of the paper's claims names figures and tables that are made
-    assert {claim[3] for claim in claims.CLAIMS} <= known
+    tables_made = set(made) - set(pictures)
+    files = {f"{name}.{suffix}" for name in tables_made for suffix in ("csv", "md", "tex")}
+    assert {path.name for path in tmp_path.iterdir()} == files
 
 
-def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path, whole_study):
+def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path):
     monkeypatch.setattr(plt.Figure, "savefig", lambda *_, **__: None)
-    runs, curves = whole_study[0]["ppo"], whole_study[1]
-    few = runs[(runs.seed == 1) & (runs.beta == 0.5) & (runs.env_id == CAR) & (runs.n_envs == 4)]
-    todo = plot.results({"ppo": few[few.n_epochs == 10]}, curves, [0.5])
+    runs = made_up(level, [CAR], [0.5], seeds=1)
+    todo = plot.results({"ppo": runs}, made_up_curves(runs), [0.5])
     del todo["coverage"]
     made, not_made = plot.make_all(todo, tmp_path)
     reasons = dict(line.split(": needs ") for line in not_made)
@@ -154,9 +138,6 @@ def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path, whole_study):
     assert reasons["performance_vs_beta"] == "at least two values of beta"
     assert reasons["transfer"] == "at least two values of method"
     assert reasons["claims"] == "the table coverage"
-    todo = plot.results({"ppo": runs[runs.vanilla]}, curves, [])
-    del todo["coverage"]
-    assert list(plot.make_all(todo, tmp_path)[0]) == ["final_returns", "final_return_per_beta"]
 
 
 def test_averages_are_of_comparable_cells_and_say_of_which():
@@ -178,17 +159,12 @@ def test_averages_are_of_comparable_cells_and_say_of_which():
     ax = plot.compare(runs, "n_envs", ["environment", "beta"]).axes[0]
     left_out = "(without 15 runs that lack a counterpart or a second seed)"
     assert ax.get_title() == f"n_envs 4, 32 in 1 environment; 30 runs\n{left_out}"
-    pendulum = runs[runs.env_id == PENDULUM]
-    expected = z_scores(pendulum).groupby(pendulum.n_envs).mean()
-    assert ax.lines[0].get_ydata() == pytest.approx(expected.to_numpy())
 
 
 def check_lines(fig, runs, by, x):
     """A line per value of `by`, of the means over x of these runs, which are of one environment."""
-    lines = fig.axes[0].lines
-    expected = z_scores(runs).groupby([runs[by], runs[x]]).mean()
+    lines, expected = fig.axes[0].lines, z_scores(runs).groupby([runs[by], runs[x]]).mean()
     values = expected.index.unique(by)
-    assert len(lines) == len(values) > 1
     for line, key, value in zip(lines, fig.legends[0].get_lines(), values, strict=True):
         assert line.get_ydata() == pytest.approx(expected[value].to_numpy())
         # Lines stand beside each other, so that their intervals can be seen
@@ -196,21 +172,20 @@ def check_lines(fig, runs, by, x):
         assert key.get_marker() == line.get_marker() and key.get_color() == line.get_color()
 
 
-def drawn(name, runs):
-    make, *arguments = plot.results({"ppo": runs}, made_up_curves(runs), [])[name]
-    return make(*arguments)
-
-
 def test_a_line_per_algorithm_n_steps_and_n_epochs():
-    runs = made_up(level, [CAR], [0, 0.5, np.nan], [1, 4])
-    check_lines(drawn("beta0_vs_vanilla", runs), runs[runs.beta != 0.5], "vanilla", "n_envs")
+    white = made_up(level, [CAR], [0, 0.5, np.nan], [1, 4])
     sizes = [(1, 4096), (2, 4096), (2, 2048), (4, 2048)]
-    runs = together(*(made_up(level, betas=[0.2, 0.5], n_envs=[n], n_steps=t) for n, t in sizes))
-    shown = runs[runs.beta == 0.5].assign(size=runs.n_envs * runs.n_steps)
-    check_lines(drawn("n_envs_vs_n_steps", runs), shown, "n_steps", "size")
+    steps = together(*(made_up(level, betas=[0.2, 0.5], n_envs=[n], n_steps=t) for n, t in sizes))
+    steps["update_size"] = steps.n_envs * steps.n_steps
     parts = [made_up(lambda _, beta, n, e=e: beta * e, n_epochs=e) for e in (10, 20)]
-    runs = together(*parts, made_up(level, betas=[2]))  # of this beta only one n_epochs
-    check_lines(drawn("n_epochs_vs_beta", runs), runs[runs.beta < 2], "n_epochs", "beta")
+    epochs = together(*parts, made_up(level, betas=[2]))  # of this beta only one n_epochs
+    for name, runs, left_out, by, x in (
+        ("beta0_vs_vanilla", white, 0.5, "vanilla", "n_envs"),
+        ("n_envs_vs_n_steps", steps, 0.2, "n_steps", "update_size"),
+        ("n_epochs_vs_beta", epochs, 2, "n_epochs", "beta"),
+    ):
+        make, *arguments = plot.results({"ppo": runs}, made_up_curves(runs), [])[name]
+        check_lines(make(*arguments), runs[runs.beta != left_out], by, x)
 
 
 def test_grids_show_performance_and_ranks_within_each_n_envs():
@@ -229,16 +204,12 @@ def test_grids_show_performance_and_ranks_within_each_n_envs():
     performance, ranks, projected = sizes  # the projections by our and by the paper's best agree
     assert performance == pytest.approx((share**6).tolist())
     assert ranks == pytest.approx([0, 1, 0.5, 0, 1])
-    for best in ({4: 0.5, 32: 1}, PAPERS_BEST):
-        order = tables.projected_ranks(pd.Series(best), [0, 0.5, 1], [4, 32])
-        expected = [*(3 - order[4]) / 2, *(order[32].iloc[1:].rank(ascending=False) - 1)]
-        assert projected == pytest.approx(expected)
+    order = tables.projected_ranks(pd.Series({4: 0.5, 32: 1}), [0, 0.5, 1], [4, 32])
+    expected = [*(3 - order[4]) / 2, *(order[32].iloc[1:].rank(ascending=False) - 1)]
+    assert projected == pytest.approx(expected)
     runs.loc[runs.beta == 0, "performance"] += 90  # best now, with n_envs 4
     titles = [ax.get_title() for ax in plot.n_envs_beta_grids(runs).axes]
     assert "by our best" in titles[2] and "by the paper's best" in titles[3]
-    runs.loc[runs.n_envs == 32, "noise_seq_len"] = 500
-    with pytest.raises(Unusable, match="one --noise-seq-len"):
-        plot.n_envs_beta_grids(runs)
 
 
 def test_learning_curves_are_means_over_seeds_beside_the_published_end():
@@ -259,8 +230,6 @@ def test_learning_curves_are_means_over_seeds_beside_the_published_end():
     assert ends == [677.5, 694.6]  # the paper's table of Sec. A14
     keys = texts(fig.legends[0].get_texts())[2:]
     assert keys == ["paper", "95 % BCa interval", "runs, if fewer than 5"]
-    ax = plot.learning_curves(runs.assign(gamma=0.9), curves, "environment").axes[0]
-    assert not [line for line in ax.lines if len(line.get_xdata()) == 1]
     two = made_up(lambda _, beta, n: n, n_envs=[1, 32])
     one, many = plot.learning_curves(two, made_up_curves(two), "n_envs").axes
     assert one.get_ylim() == many.get_ylim()
@@ -287,16 +256,11 @@ def test_verdicts_show_the_interval_and_where_it_must_lie():
     ends = [ax.collections[0].get_paths()[0].get_extents().intervalx for ax in (above, below)]
     assert ends[0].tolist() == [0, above.get_xlim()[1]] and ends[1][1] == 0.1
     assert "1 more" in fig.get_suptitle()
-    with pytest.raises(Unusable, match="runs of a claim"):
-        plot.verdicts(pd.DataFrame(COVERAGE[-1:]))
 
 
 def test_other_methods_beside_ppo():
     """All are standardized together, at the betas that all have."""
-    parts = [
-        made_up(lambda _, beta, n, i=i: 10 * i + beta, [CAR], method=method)
-        for i, method in enumerate(("ppo", "trpo", "a2c"))
-    ]
+    parts = [made_up(level, [CAR], method=method) for method in ("ppo", "trpo", "a2c")]
     runs = together(*parts)
     fig = plot.transfer(together(runs, made_up(level, [CAR], [2])))
     check_lines(fig, runs, "method", "beta")
@@ -336,15 +300,9 @@ def test_noise_is_beside_its_closed_forms():
         np.testing.assert_allclose(measured, closed, rtol=0.25)
         ax = figures["noise_two_step"].axes[i]
         assert f"closed form {correlations[i]:z.2f}" in ax.get_title()
-        pairs = ax.collections[0].get_offsets().T
-        assert np.corrcoef(pairs)[0, 1] == pytest.approx(correlations[i], abs=0.05)
-        density = [bar.get_height() for bar in figures["noise_marginal"].axes[i].patches]
-        assert max(density) == pytest.approx(0.4, abs=0.02)
     spread = figures["noise_bias"].axes[1].lines
-    expected = mean_std(betas, 1000).tolist()
-    assert [line.get_ydata()[0] for line in spread[:3]] == pytest.approx(expected, rel=0.05)
-    walk = figures["noise_random_walks"].axes[1].lines[0].get_ydata()
-    np.testing.assert_allclose(walk, plot.draw_noise(0.5, 4, 2)[0, 1].cumsum(0), rtol=1e-6)
+    measured = [line.get_ydata()[0] for line in spread[:3]]
+    np.testing.assert_allclose(measured, mean_std(betas, 1000), rtol=0.05)
 
 
 def test_the_command_replaces_earlier_figures_and_reports(monkeypatch, tmp_path, capsys):
@@ -370,24 +328,10 @@ def test_the_command_replaces_earlier_figures_and_reports(monkeypatch, tmp_path,
     assert {path.stem for path in tmp_path.iterdir()} == names
     table = pd.read_csv(tmp_path / "final_returns.csv")
     assert set(table.environment) == {"Pendulum Swingup"} and table.beta.tolist() == [0, 1]
-    report = (tmp_path / "report.txt").read_text()
-    assert report.startswith("made: final_returns, final_return_per_beta\nleft out: 0\n")
-    with pytest.raises(Unusable, match="a complete run of the method trpo"):
-        command(files[0], "--method", "trpo")
-
-
-def test_the_environments_picture(monkeypatch):
-    """Each environment's name stands above its square picture, also where a frame is wide."""
-    frame = np.zeros((400, 600, 3), np.uint8)
-    env = types.SimpleNamespace(reset=lambda seed: None, close=lambda: None, render=lambda: frame)
-    monkeypatch.setattr(ppo, "make_env", lambda args, render_mode: env)
-    axes = plot.contact_sheet().axes
-    assert [ax.get_title() for ax in axes] == list(NAMES.values())
-    assert {ax.images[0].get_array().shape for ax in axes} == {(400, 400, 3), (600, 600, 3)}
 
 
 def test_untrained_cars_are_those_of_a_first_rollout():
-    """Stepped by hand in Gymnasium, with the script's own exploration(). At the goal they stay."""
+    """Stepped by hand in Gymnasium, with the script's own exploration()."""
     positions = plot.untrained_positions(0.5, n_cars=3, n_steps=200, seed=4)
     torch.manual_seed(4)
     args = argparse.Namespace(n_steps=200, n_envs=3, vanilla=False)
@@ -398,19 +342,15 @@ def test_untrained_cars_are_those_of_a_first_rollout():
         np.testing.assert_allclose(positions[t], obs[:, 0], atol=1e-6)
         actions = np.clip(act(obs, t), -1, 1)
         obs = np.array([env.step(a)[0] for env, a in zip(envs, actions, strict=True)])
-    there = plot.untrained_positions(1) >= 0.45
-    assert (np.diff(there.astype(int), axis=0) >= 0).all()
-    assert 30 <= there[-1].sum() < 49
 
 
-def test_the_animation(monkeypatch):
+def test_the_animation(monkeypatch, tmp_path):
     """Cars are where they are on the hill, and those at the goal are counted."""
     cars = {0: np.array([[-0.5, -0.6], [-0.4, 0.2]]), 1: np.array([[-0.5, -0.6], [0.46, 0.1]])}
     monkeypatch.setattr(plot, "untrained_positions", cars.get)
     movie = plot.animation([0, 1], n_frames=2)
-    movie._draw_frame(1)
-    white, pink = movie._fig.axes
-    assert white.get_title().endswith("(white), step 1\nat the goal: 0 of 2")
+    movie.save(tmp_path / "animation.gif", plot.PillowWriter(fps=15), dpi=20)
+    _, pink = movie._fig.axes
     assert pink.get_title().endswith("(pink), step 1\nat the goal: 1 of 2")
     x, y = pink.lines[-1].get_data()
     assert list(x) == [0.46, 0.1]

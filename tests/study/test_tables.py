@@ -47,10 +47,7 @@ def test_best_beta_per_n_envs(made_up):
 
 
 def test_averages_are_of_comparable_cells_that_weigh_the_same(made_up):
-    """The sweep `main` for beta 0 and 0.5, and `n_epochs`, which adds 0.2 and 0.75 at n_envs 4.
-
-    n_envs 32 is hard, so that pooled over all runs beta 0.5 would look worse than 0.2 and 0.75.
-    """
+    """n_envs 32 is hard: pooled over all runs beta 0.5, which is there, too, would look bad."""
     levels = {0: 1, 0.2: 2, 0.5: 4, 0.75: 3}
     four = made_up(lambda e, beta, n: levels[beta], [PENDULUM], [*levels], [4])
     more = made_up(lambda e, beta, n: -9 + 6 * beta, [PENDULUM], [0, 0.5], [32], seeds=2)
@@ -88,7 +85,6 @@ def test_final_return_tables(tmp_path, write_run, selected, short_study):
     ]
     summary = tables.final_return_and_performance(runs[~runs.vanilla]).iloc[0]
     assert summary.final_return_mean == pytest.approx((677.54 + 694.66 + 403.1) / 3)
-    assert summary.performance_max == pytest.approx(347.83)
     assert summary.paper_performance_max == 678.91
 
 
@@ -117,8 +113,8 @@ def test_final_returns_on_the_published_scale(made_up):
     other = one.assign(beta=1.0, gamma=0.9)  # not the paper's settings, and no beta of it:
     more = [one.assign(n_envs=32, final_return=0.0), one.assign(beta=0.3), other]
     table = tables.average_final_returns(pd.concat([runs, *more], ignore_index=True))
-    columns = table[["n_envs", "beta", "runs", "environments"]]
-    assert columns.to_numpy().tolist() == [[4, 0, 4, 2], [4, 0.2, 4, 2], [32, 0.2, 1, 1]]
+    counts = table[["n_envs", "beta", "runs", "environments"]].to_numpy().tolist()
+    assert counts == [[4, 0, 4, 2], [4, 0.2, 4, 2], [32, 0.2, 1, 1]]
     np.testing.assert_allclose(table["mean"], [0, (1 + 0.2) / 2, 0], atol=1e-9)
     paper = [(677.5 - 1.1) / 765.8 / 2, (1 + 23.4 / 96.7) / 2, 93.8 / 96.7]
     np.testing.assert_allclose(table.paper, paper)
