@@ -1,7 +1,7 @@
 """Makes the figures of results/ and fills in the tables of its texts, from the CSV files there.
 
     results/make.sh            makes all anew
-    results/make.sh --check    changes nothing; names what differs from the data and exits with 1
+    results/make.sh --check    changes nothing; names what differs from the data, and exits with 1
 
 A table stands in a text between <!-- table: NAME --> and <!-- end -->, and is made by the function
 of that name here. Two pictures are the same if no pixel differs by more than TOLERANCE of 255:
@@ -96,7 +96,10 @@ def runs():
     others = [file.name for file in sorted(RESULTS.glob("*.csv")) if file.name not in STUDY]
     others = [file for file in others if file != "benchmark.csv"]
     texts = []
-    for name, files in (*((f"`{file}`", [file]) for file in STUDY), ("all others", others)):
+    for name, files in (
+        *((f"`{file}`", [file]) for file in STUDY),
+        ("others: [notes](notes.md)", others),
+    ):
         made = pd.concat([complete(file) for file in files], ignore_index=True)
         seeds = made.groupby(["env_id", "beta", "n_envs"]).seed.nunique()
         episodes = spread(made.eval_episodes.astype(int))
@@ -119,7 +122,7 @@ def offset():
     """How far our final returns are from the published, and where most."""
     whole, tasks = claims.offset(runs_of(*STUDY)[0]["ppo"])
     first, second, *_, last = tasks.split(", ")
-    return f"{whole[0].upper()}{whole[1:]}: {first}, {second} to {last}.\n"
+    return f"{whole[0].upper()}{whole[1:]}. By task: from {first} and {second} to {last}.\n"
 
 
 def counts():
