@@ -95,11 +95,9 @@ def runs():
     """What was run, a row for the reproduction, the rest of the study, and all other files."""
     others = [file.name for file in sorted(RESULTS.glob("*.csv")) if file.name not in STUDY]
     others = [file for file in others if file != "benchmark.csv"]
+    groups = {f"`{file}`": [file] for file in STUDY} | {"others: [notes](notes.md)": others}
     texts = []
-    for name, files in (
-        *((f"`{file}`", [file]) for file in STUDY),
-        ("others: [notes](notes.md)", others),
-    ):
+    for name, files in groups.items():
         made = pd.concat([complete(file) for file in files], ignore_index=True)
         seeds = made.groupby(["env_id", "beta", "n_envs"]).seed.nunique()
         episodes = spread(made.eval_episodes.astype(int))
