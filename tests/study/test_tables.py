@@ -17,8 +17,8 @@ def test_best_beta_per_env(made_up):
     two = made_up(lambda e, beta, n: levels[beta], envs=[PENDULUM], **few)
     two["performance"] += np.random.default_rng(1).normal(size=len(two)) * 0.4
     one = made_up(lambda e, beta, n: -beta, envs=[CAR], betas=(0, 0.5), n_envs=[4], seeds=1)
-    table = tables.best_beta_per_env(pd.concat([two, one], ignore_index=True))
-    table = table.set_index("environment")
+    both = pd.concat([two, one], ignore_index=True)
+    table = tables.best_beta_per_env(both).set_index("environment")
     pooled = {beta: group.performance for beta, group in two.groupby("beta")}
     row = table.loc["Pendulum Swingup"]
     assert row.best_beta == 0.5 == max(pooled, key=lambda beta: pooled[beta].mean())
