@@ -24,7 +24,6 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from colored_noise import autocovariance, mean_std
 from study.protocol import BETAS, COMPLEX, N_ENVS, NAMES, SETTINGS
 from study.runs import AXES, CELL, SHARED, Unusable, differences, main_grid, published, value_text
 from study.statistics import contrast, interval, standardize, summed
@@ -241,24 +240,6 @@ def slope_per_doubling(n_envs):
 
 
 # --- Tests: what is compared for each claim -------------------------------------------------------
-
-
-def rises(values, what):
-    """Finding on "it rises with beta". values: one for each of BETAS."""
-    text = ", ".join(f"{beta:g}: {value:z.2f}" for beta, value in zip(BETAS, values, strict=True))
-    holds = "holds" if (np.diff(values) > 0).all() else "does not"
-    return Finding(holds, f"{what} at beta {text}")
-
-
-def noise_is_correlated():
-    """Closed forms. White noise's is 0, so where it rises it is positive for beta > 0."""
-    lags = [autocovariance(beta, 1000) for beta in BETAS]
-    return rises([float(lag[1] / lag[0]) for lag in lags], "two-step correlation")
-
-
-def bias_spreads():
-    std = mean_std(np.array(BETAS, float), 1000).numpy()
-    return rises(std, "standard deviation of a sequence's mean")
 
 
 def two_and_four_best(runs):
@@ -580,11 +561,11 @@ CLAIMS = [  # where, what it shows or says, preset, file, name of its runs, test
     ("Fig. 5", "beta 0.5 with n_envs 4 is the best configuration", "main", "n_envs_beta_grids",
      "main", best_configuration),
     ("Fig. 6", "a sequence's mean spreads more with larger beta", "noise", "noise_bias", None,
-     bias_spreads),
+     None),
     ("Fig. 7, conclusion v", "ranks follow those projected from the bias", "main",
      "n_envs_beta_grids", "main", ranks_as_projected),
     ("Fig. A1", "subsequent steps are correlated where beta > 0, more with larger beta", "noise",
-     "noise_two_step", None, noise_is_correlated),
+     "noise_two_step", None, None),
     ("Fig. A1", "each step is Gaussian", "noise", "noise_marginal", None, None),
     ("Table A2", "best beta per n_envs", "main", "best_beta_per_n_envs", "main", None),
     ("Fig. A6", "beta 0 matches vanilla PPO", "main, vanilla", "beta0_vs_vanilla", "vanilla",
@@ -649,11 +630,9 @@ def coverage(methods, curves):
 
 
 def tested(test, runs):
-    """The Finding of a claim's test, blank without one. runs: None where it needs none."""
+    """The Finding of a claim's test, blank without one."""
     if test is None:
         return Finding("", "")
-    if runs is None:
-        return test()
     if runs.empty:
         return Finding("open", "no runs", decides="runs")
     try:

@@ -37,7 +37,7 @@ def verdicts(coverage):
 
 
 def test_every_claim_has_a_row():
-    """Whatever the runs; what the noise alone shows holds."""
+    """Whatever the runs."""
     axes = {"method": [], "environment": [], "beta": 0.0, "n_envs": 0, "n_steps": 0, "n_epochs": 0}
     runs = pd.DataFrame({**axes, "seed": 0, "vanilla": False, "env_id": [], "performance": 0.0})
     table = claims.coverage({"ppo": runs}, pd.DataFrame()).set_index("says")
@@ -45,10 +45,6 @@ def test_every_claim_has_a_row():
     assert (table.verdict == "open").sum() == 27 == (table.data == "no runs").sum()
     assert table.runs["final returns"] == "0 of 23040"
     assert table.command["final returns"].startswith("./run_sweep.sh main; ./run_sweep.sh vanilla;")
-    spread = table.loc["a sequence's mean spreads more with larger beta"]
-    assert spread.verdict == "holds" and "0: 0.03, 0.2: 0.05, 0.5: 0.11" in spread.data
-    correlated = table[table.file == "noise_two_step"].iloc[0]
-    assert correlated.verdict == "holds" and "0: 0.00, 0.2: 0.1" in correlated.data
 
 
 def test_claims_on_noise_flip_with_the_data(made_up, coverage):
