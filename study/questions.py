@@ -137,10 +137,10 @@ def mountain_car():
     return pd.DataFrame(rows).fillna("") if rows else None
 
 
-def gymnasium_scores(measure="last five"):
+def gymnasium_scores(last=5):
     """Scores of the runs of `run_sweep.sh gymnasium`: {(task, n_envs, beta): (seeds,)}.
 
-    measure: "last five" evaluations' mean, or "all" twenty's, the area under the curve. Only tasks
+    The mean of a run's last evaluations; of all twenty it is the area under the curve. Only tasks
     with all betas and n_envs, two seeds each.
     """
     file = RESULTS / "gymnasium.csv"
@@ -148,54 +148,52 @@ def gymnasium_scores(measure="last five"):
         return {}
     runs, curves = load([file])
     runs, curves = (table[runs.status == "complete"] for table in (runs, curves))
-    curves = curves.dropna(axis=1)
-    runs["score"] = (curves.iloc[:, -5:] if measure == "last five" else curves).mean(axis=1)
-    cells = runs.groupby(["env_id", "n_envs", "beta"]).score.apply(np.array)
+    scores = curves.dropna(axis=1).iloc[:, -last:].mean(axis=1)
+    cells = scores.groupby([runs.env_id, runs.n_envs, runs.beta]).apply(np.array)
     cells = cells[cells.map(len) > 1]
     tasks = [task for task in GYMNASIUM if len(cells.get(task, [])) == 6]
     return {key: cells[key] for key in cells.index if key[0] in tasks}
 
 
-def gymnasium_leads(scores, beta, n_envs, draws=None):
-    """Lead of a beta over white noise in each task, in its standard deviations: (tasks, draws).
+def lead(scores, task, n_envs, beta):
+    """Lead of a beta over white noise in a task, its variance by seeds, and degrees of freedom.
 
-    That is pooled over the betas of the task with this n_envs. draws: how often seeds are drawn
-    anew, or None for those that there are.
+    In standard deviations, pooled over the betas of the task with this n_envs.
     """
-    leads, rng = [], np.random.default_rng([0, n_envs, int(2 * float(beta))])
-    for task in dict.fromkeys(task for task, _, _ in scores):
-        cells = [x for (name, n, _), x in scores.items() if (name, n) == (task, n_envs)]
-        squares = sum(((x - x.mean()) ** 2).sum() for x in cells)
-        std = (squares / sum(len(x) - 1 for x in cells)) ** 0.5
-        pair = [scores[task, n_envs, which] for which in (beta, "0")]
-        if draws:
-            pair = [x[rng.integers(len(x), size=(draws, len(x)))].T for x in pair]
-        leads.append((pair[0].mean(0) - pair[1].mean(0)) / std)
-    return np.array(leads)
+    cells = [x for (name, n, _), x in scores.items() if (name, n) == (task, n_envs)]
+    ours, white = scores[task, n_envs, beta], scores[task, n_envs, "0"]
+    df = sum(len(x) - 1 for x in cells)
+    std = (sum(((x - x.mean()) ** 2).sum() for x in cells) / df) ** 0.5
+    return (ours.mean() - white.mean()) / std, 1 / len(ours) + 1 / len(white), df
 
 
-def gymnasium(measure="last five", draws=10_000):
-    """Gymnasium's tasks: leads over white noise in standard deviations. A n_envs 1, B n_envs 32."""
-    scores = gymnasium_scores(measure)
-    if not scores:
+def interval_text(mean, se, df, level=0.95):
+    half = stats.t.ppf((1 + level) / 2, df) * se
+    return f"{mean - half:z.2f} to {mean + half:z.2f}"
+
+
+def gymnasium(last=5):
+    """Gymnasium: leads over white noise in standard deviations. A: n_envs 1, B: n_envs 32."""
+    scores = gymnasium_scores(last)
+    tasks = list(dict.fromkeys(task for task, _, _ in scores))
+    if not tasks:
         return None
     columns = {
-        f"{name}: {beta} over 0": [gymnasium_leads(scores, beta, n, d) for d in (None, draws)]
+        f"{name}: {beta} over 0": np.array([lead(scores, task, n, beta) for task in tasks])
         for name, n in (("A", 1), ("B", 32))
         for beta in ("0.5", "1")
     }
-    a, b = columns["A: 1 over 0"], columns["B: 1 over 0"]
-    columns["B less A: 1 over 0"] = [y - x for x, y in zip(a, b, strict=True)]
-    tasks = list(dict.fromkeys(task for task, _, _ in scores))
-    which = np.random.default_rng(1).integers(len(tasks), size=(len(tasks), draws))
-    table = pd.DataFrame({"task": [*tasks, "average", "95 %, by tasks and seeds",
-                                   "98.75 %, by tasks and seeds", "95 %, by seeds"]})  # fmt: skip
-    for name, (leads, drawn) in columns.items():
-        by_tasks = np.take_along_axis(drawn, which, axis=0).mean(0)
-        intervals = [(by_tasks, 2.5), (by_tasks, 0.625), (drawn.mean(0), 2.5)]
-        ends = [np.percentile(x, [tail, 100 - tail]) for x, tail in intervals]
-        numbers = [f"{x:z.2f}" for x in (*leads, leads.mean())]
-        table[name] = numbers + [f"{low:z.2f} to {high:z.2f}" for low, high in ends]
+    gain = columns["A: 1 over 0"] * [-1, 1, 1] + columns["B: 1 over 0"]
+    columns["1 over 0: B less A"] = gain
+    rows = ["average", "for these tasks, 95 %", "the same, 98.3 %", "for tasks like these, 95 %"]
+    table = pd.DataFrame({"task": [*tasks, *rows]})
+    for name, (leads, variances, df) in ((name, x.T) for name, x in columns.items()):
+        n, mean = len(tasks), leads.mean()
+        by_seeds = mean, variances.sum() ** 0.5 / n, df.sum()
+        ends = [interval_text(*by_seeds), interval_text(*by_seeds, 1 - 0.05 / 3), ""]
+        if n > 1:
+            ends[2] = interval_text(mean, leads.std(ddof=1) / n**0.5, n - 1)
+        table[name] = [f"{x:z.2f}" for x in (*leads, mean)] + ends
     return table
 
 

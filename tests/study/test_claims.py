@@ -298,9 +298,12 @@ def test_cells_outside_are_compared_with_chance():
     ends = [mean_interval(sample, 999)[1:] for sample in samples]
     missed = [not low < mean < high for (low, high), mean in zip(ends, means, strict=True)]
     assert np.mean(missed) == pytest.approx(claims.MISSES[5], abs=0.07)
-    table = pd.DataFrame({"in_interval": ["yes", "no", "yes", np.nan], "runs": [5, 5, 3, 1]})
-    count, chance, line = claims.outside(table)
-    assert count == 1 and chance == pytest.approx(2 * 0.191 + 0.0675, abs=1e-3)
+    table = pd.DataFrame(
+        {"in_interval": ["yes", "no", "yes", np.nan, "no"], "runs": [5, 5, 3, 1, 5]}
+    )
+    table = table.assign(low=0, high=[1, 1, 1, np.nan, 0])  # the last without scatter
+    count, n, chance, line = claims.outside(table)
+    assert count == 1 and n == 3 and chance == pytest.approx(2 * 0.191 + 0.0675, abs=1e-3)
     assert line.startswith("1 of 3 published means outside")
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from study import questions
 from study.protocol import GYMNASIUM
@@ -13,17 +14,33 @@ def test_leads_in_gymnasium_are_those_put_in(monkeypatch):
     for scale, task in enumerate(GYMNASIUM, start=1):
         for n_envs in (1, 32):
             for beta, lead in (("0", 0), ("0.5", 1), ("1", -0.5 * (n_envs == 32))):
-                x = rng.normal(size=400)
+                x = rng.normal(size=8)
                 scores[task, n_envs, beta] = 10**scale * ((x - x.mean()) / x.std(ddof=1) + lead)
-    monkeypatch.setattr(questions, "gymnasium_scores", lambda measure: scores)
-    table = questions.gymnasium(draws=500).set_index("task")
+    monkeypatch.setattr(questions, "gymnasium_scores", lambda last: scores)
+    table = questions.gymnasium().set_index("task")
     assert (table["A: 0.5 over 0"][GYMNASIUM].astype(float) == 1).all()
     assert table.loc["average"].astype(float).tolist() == [1, 0, 1, -0.5, -0.5]
-    # The error of a mean of six tasks by 400 seeds, and of tasks that are all the same
-    low, high = map(float, table["A: 0.5 over 0"]["95 %, by seeds"].split(" to "))
-    assert (high - low) / 2 == pytest.approx(1.96 * (2 / 400 / 6) ** 0.5, abs=0.015)
-    wider = table["A: 0.5 over 0"]["95 %, by tasks and seeds"].split(" to ")
-    assert float(wider[1]) - float(wider[0]) > high - low
+    half = stats.t.ppf(0.975, 6 * 21) * (2 / 8 / 6) ** 0.5
+    ends = table["A: 0.5 over 0"]["for these tasks, 95 %"].split(" to ")
+    assert [float(end) for end in ends] == pytest.approx([1 - half, 1 + half], abs=0.005)
+    assert table["A: 0.5 over 0"]["for tasks like these, 95 %"] == "1.00 to 1.00"
+
+
+def test_the_interval_of_these_tasks_holds_what_it_should(monkeypatch):
+    """Of 200 made-up studies, whose tasks differ."""
+    rng, held, tasks = np.random.default_rng(0), 0, GYMNASIUM
+    leads = rng.normal(size=len(tasks))
+    cells = {(i, n, beta) for i in range(len(tasks)) for n in (1, 32) for beta in ("0", "0.5", "1")}
+    for _ in range(200):
+        scores = {
+            (tasks[i], n, beta): rng.normal(leads[i] * (beta == "0.5"), size=8)
+            for i, n, beta in sorted(cells)
+        }
+        monkeypatch.setattr(questions, "gymnasium_scores", lambda last, made=scores: made)
+        table = questions.gymnasium().set_index("task")["A: 0.5 over 0"]
+        low, high = map(float, table["for these tasks, 95 %"].split(" to "))
+        held += low < leads.mean() < high
+    assert 0.9 <= held / 200 <= 0.99
 
 
 def test_welchs_interval_and_the_order():
