@@ -421,7 +421,7 @@ def verdicts(table):
     fig, axes = plt.subplots(len(units), figsize=size, squeeze=False, height_ratios=counts)
     for ax, (unit, rows) in zip(axes[:, 0], units.items(), strict=True):
         length = rows.high - rows.low
-        seen = rows[~(length > 1.5 * length.median())]
+        seen = rows[~(length > 2 * length.median())]
         left, right = np.nan_to_num([seen.low.min(), seen.high.max()])
         pad = 0.05 * (right - left) or 1
         ends = ax.set_xlim(min(left, 0) - pad, max(right, 0) + pad)
