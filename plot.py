@@ -45,7 +45,7 @@ from study.statistics import FEW, cells_intervals, mean_interval, standardize
 
 # --- Drawing --------------------------------------------------------------------------------------
 
-plt.rc("figure", dpi=150)
+plt.rc("figure", dpi=150, labelsize="medium")
 plt.rc("figure.constrained_layout", use=True)
 plt.rc("font", size=9)
 plt.rc("axes", titlesize=9, grid=True, axisbelow=True)
@@ -88,19 +88,16 @@ def extent(runs):
 
 
 def panels(count, xlabel="", ylabel="", width=2.5, height=1.9, sharey=False):
-    """A figure with a list of `count` axes, at most four in a row, labelled left and below."""
+    """A figure with a list of `count` axes, at most four in a row; labels are of all together."""
     rows = math.ceil(count / 4)
     columns = math.ceil(count / rows)
     size = max(width * columns, 5), height * rows + 0.5
     fig, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, sharey=sharey)
     for ax in axes.flat[count:]:
         ax.remove()
-    axes = list(axes.flat[:count])
-    for ax in axes[::columns]:
-        ax.set_ylabel(ylabel)
-    for ax in axes[-columns:]:
-        ax.set_xlabel(xlabel)
-    return fig, axes
+    fig.supxlabel(xlabel)
+    fig.supylabel(ylabel, multialignment="center")
+    return fig, list(axes.flat[:count])
 
 
 def legend_above(fig, *entries, betas=(), paper=False):
@@ -381,8 +378,9 @@ def beside_published(averages, runs):
     """
     runs = tables.on_published_scale(runs)
     cells = runs.groupby([*CELL, "beta"])[["final_return", "paper"]].mean()
+    scale = "0 is the environment's lowest published mean, 1 its highest"
     how = {"height": 2.6, "sharey": True}
-    fig, axes = panels(1 + averages.n_envs.nunique(), BETA, "our final return", **how)
+    fig, axes = panels(1 + averages.n_envs.nunique(), scale, "our final return", **how)
     axes[0].axline((0, 0), slope=1, color="0.6", lw=0.9)
     for beta, group in cells.groupby("beta"):
         axes[0].plot(group.paper, group.final_return, **look(beta), ls="", ms=4, alpha=0.8)
@@ -393,15 +391,15 @@ def beside_published(averages, runs):
         for beta, paper in table.paper.items():
             ax.plot(beta, paper, **look(beta), mfc="none", ms=8)
         draw_betas(ax, table, most=4)
-        ax.set_title(f"n_envs {n_envs}, environments: {table.environments.iloc[0]}")
+        title = f"n_envs {n_envs}, environments: {table.environments.iloc[0]}"
+        ax.set(title=title, xlabel=BETA)
     interval = ("95 % BCa interval", {"lw": 1.1})
     legend_above(fig, interval, betas=sorted(cells.index.unique("beta")), paper=True)
-    fig.supxlabel("0 is the environment's lowest published mean, 1 its highest", size=8)
     return fig
 
 
 def with_runs(table):
-    """Which rows of `coverage` are of a claim that there are runs for, or of a closed form."""
+    """Which rows of `coverage` are of a claim that there are runs for."""
     return (table.verdict != "") & ~table.data.str.fullmatch("no runs[^;]*")
 
 
@@ -412,8 +410,7 @@ def verdicts(table):
     intervals than the others are cut. Where there is none, the text says why. Left out are claims
     that nothing is tested for, and those that there are no runs for.
     """
-    lacking = (table.verdict != "").sum() - with_runs(table).sum()
-    table = table[with_runs(table)]
+    table, tested = table[with_runs(table)], (table.verdict != "").sum()
     need(len(table), "runs of a claim")
     units = {unit: rows for unit, rows in table.groupby("unit", sort=False)}
     counts = [len(rows) for rows in units.values()]
@@ -428,8 +425,7 @@ def verdicts(table):
         for place, row in enumerate(rows.itertuples()):
             style, where = VERDICT_LOOK[row.verdict], {"transform": ax.get_yaxis_transform()}
             if np.isnan(row.low):
-                text = "closed form" if row.runs == "none needed" else row.data
-                text = textwrap.fill(textwrap.shorten(text, 130, placeholder=" ..."), 68)
+                text = textwrap.fill(textwrap.shorten(row.data, 130, placeholder=" ..."), 68)
                 ax.text(0.01, place, text, va="center", color="0.4", size=6, **where)
             else:
                 must = np.clip([row.least, row.most], *ends)
@@ -441,9 +437,7 @@ def verdicts(table):
         ax.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
         ax.grid(visible=False, axis="y")
     title = "95 % intervals, longer where several are compared. A claim can hold only in the gray"
-    fig.suptitle(
-        title + f"\n({lacking} more are open for lack of runs)" * bool(lacking), fontsize=9
-    )
+    fig.suptitle(f"{title}\n(those of {tested} that there are runs for)", fontsize=9)
     return fig
 
 
@@ -480,7 +474,7 @@ def untrained_positions(beta, n_cars=50, n_steps=999, seed=1):
     envs, noise = ppo.make_vector_env(args, n_cars), ColoredNoiseProcess(beta, n_cars, 1, seed=seed)
     act, there = ppo.exploration(ppo.Agent(2, 1), noise, args), np.zeros(n_cars, bool)
     obs, _ = envs.reset(seed=seed)
-    positions = [obs[:, 0]]
+    positions = [obs[:, 0].copy()]  # the environments write into obs again
     for step in range(n_steps):
         obs, _, terminated, _, _ = envs.step(np.clip(act(obs, step), -1, 1))
         there |= terminated
@@ -609,10 +603,10 @@ def results(methods, curves, betas):
         "beside_published": (beside_published, "average_final_returns", main),
     }
     lines = colored[colored.beta.isin(betas)]
-    for n_envs, group in lines.groupby("n_envs"):
+    for n_envs, group in averaged(lines).groupby("n_envs"):
         todo[f"learning_curves_n_envs_{n_envs}"] = (learning_curves, group, curves, "environment")
     for environment, group in lines.groupby("environment"):
-        if group.n_envs.nunique() > 1:
+        if group.n_envs.nunique() > 1 or group.env_id.iloc[0] in COMPLEX:
             name = re.sub(r"\W", "", environment.lower().replace(" ", "_"))
             todo[f"learning_curves_{name}"] = (learning_curves, group, curves, "n_envs")
     return todo

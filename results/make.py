@@ -140,7 +140,7 @@ def lead():
 def verdicts():
     """The claims of the paper that there are runs for."""
     table = coverage()
-    table = table[plot.with_runs(table) & (table.runs != "none needed")]
+    table = table[plot.with_runs(table)]
     columns = {"where": "where", "says": "the paper says", "verdict": "so far", "data": "our runs"}
     columns["decides"] = "what would decide"
     return markdown(table[[*columns]].rename(columns=columns))

@@ -229,7 +229,7 @@ def save_table(table, out, name):
     def text(value):
         if isinstance(value, str) or pd.isna(value):
             return value if isinstance(value, str) else ""
-        return f"{round(value, 2):g}" if abs(value) >= 0.01 else f"{value:.2g}"
+        return f"{round(float(value), 2):g}" if abs(value) >= 0.01 else f"{value:.2g}"
 
     shown = table.map(text)
     table.to_csv(out / f"{name}.csv", index=False)
