@@ -23,7 +23,6 @@ from PIL import Image
 
 import plot
 from study import claims, questions
-from study.protocol import COMPLEX
 from study.runs import CELL, Unusable, differences, load, main_grid, published, select_methods
 from study.statistics import contrast, interval, mean_interval, standardize
 from study.tables import final_return_per_beta, final_returns, markdown
@@ -56,10 +55,15 @@ def coverage():
     return claims.coverage(*study_runs())
 
 
+def main_runs():
+    """Those of PPO with colored noise that are averaged in the figures."""
+    return claims.of_most(plot.averaged(main_grid(study_runs()[0]["ppo"])[0]))
+
+
 def colored(n_envs):
-    """The paper's PPO runs with these n_envs and BETAS, of environments that have all these."""
-    runs, _ = main_grid(study_runs()[0]["ppo"])
-    runs = runs[runs.n_envs.isin(n_envs) & runs.beta.isin(BETAS) & ~runs.env_id.isin(COMPLEX)]
+    """Main runs with these n_envs and BETAS, of environments that have all these n_envs."""
+    runs = main_runs()
+    runs = runs[runs.n_envs.isin(n_envs) & runs.beta.isin(BETAS)]
     return runs[runs.groupby("environment").n_envs.transform("nunique") == len(n_envs)]
 
 
@@ -102,7 +106,7 @@ def final_returns_of_four():
 
 def offset():
     """How far our final returns are from the published, and where most."""
-    whole, tasks = claims.offset(study_runs()[0]["ppo"])
+    whole, tasks = claims.offset(main_runs())
     first, second, *_, last = tasks.split(", ")
     return f"{whole[0].upper()}{whole[1:]}. By task: from {first} and {second} to {last}.\n"
 
