@@ -23,13 +23,20 @@ import torch
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, NullLocator
+from matplotlib.ticker import EngFormatter
 from scipy import stats
 from tqdm import tqdm
 
 import ppo_colored_continuous as ppo
 import study.runs
-from colored_noise import autocovariance, colored_noise, expected_psd, marginal_variance, mean_std
+from colored_noise import (
+    ColoredNoiseProcess,
+    autocovariance,
+    colored_noise,
+    expected_psd,
+    marginal_variance,
+    mean_std,
+)
 from study import claims, tables
 from study.environments import prepare_rendering
 from study.protocol import BETAS, COMPLEX, NAMES, SETTINGS
@@ -38,6 +45,7 @@ from study.statistics import FEW, cells_intervals, mean_interval, standardize
 
 # --- Drawing --------------------------------------------------------------------------------------
 
+plt.rc("figure", dpi=150, labelsize="medium")
 plt.rc("figure.constrained_layout", use=True)
 plt.rc("font", size=9)
 plt.rc("axes", titlesize=9, grid=True, axisbelow=True)
@@ -60,6 +68,7 @@ VERDICT_LOOK = {
     "does not": {"color": "#D55E00", "marker": "X"},
     "open": {"color": "0.4", "marker": "o", "mfc": "white"},
 }
+GOAL = 0.45  # of Mountain Car
 INTERVAL = "(mean, 95 % interval if two seeds)"
 
 
@@ -70,34 +79,25 @@ def look(beta):
     return {"color": plt.get_cmap("plasma")(0.82 * place / (len(BETAS) - 1)), "marker": marker}
 
 
-def environments(count):
-    return f"{count} environment{'s'[: count > 1]}"
-
-
-def extent(runs, of=None):
-    """What a figure is made of, for its title; `of`: the runs that they were chosen from."""
+def extent(runs):
+    """What a figure is made of, for its title."""
     there = runs.groupby("environment").n_envs.agg(lambda n: ", ".join(map(str, sorted(set(n)))))
     counts = there.value_counts().sort_index()
-    parts = [f"n_envs {n} in {environments(count)}" for n, count in counts.items()]
-    text = textwrap.fill("; ".join([*parts, f"{len(runs)} runs"]), 62)
-    left = 0 if of is None else len(of) - len(runs)
-    return text + f"\n(without {left} runs that lack a counterpart or a second seed)" * (left > 0)
+    parts = [f"n_envs {n} in {count} environment{'s'[: count > 1]}" for n, count in counts.items()]
+    return textwrap.fill("; ".join([*parts, f"{len(runs)} runs"]), 62)
 
 
 def panels(count, xlabel="", ylabel="", width=2.5, height=1.9, sharey=False):
-    """A figure with a list of `count` axes, at most four in a row, labelled left and below."""
+    """A figure with a list of `count` axes, at most four in a row; labels are of all together."""
     rows = math.ceil(count / 4)
     columns = math.ceil(count / rows)
     size = max(width * columns, 5), height * rows + 0.5
     fig, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, sharey=sharey)
     for ax in axes.flat[count:]:
         ax.remove()
-    axes = list(axes.flat[:count])
-    for ax in axes[::columns]:
-        ax.set_ylabel(ylabel)
-    for ax in axes[-columns:]:
-        ax.set_xlabel(xlabel)
-    return fig, axes
+    fig.supxlabel(xlabel)
+    fig.supylabel(ylabel, multialignment="center")
+    return fig, list(axes.flat[:count])
 
 
 def legend_above(fig, *entries, betas=(), paper=False):
@@ -109,10 +109,9 @@ def legend_above(fig, *entries, betas=(), paper=False):
     keys |= {"paper": [look(beta) | {"ls": "", "mfc": "none"} for beta in betas]} if paper else {}
     keys |= {label: [{"color": INK, **style}] for label, style in entries}
     handles = [tuple(Line2D([], [], **style) for style in styles) for styles in keys.values()]
-    rows = -(-len(handles) // int(fig.get_figwidth() / 1.1))
-    how = {"loc": "outside upper center", "ncols": -(-len(handles) // rows)}
-    how |= {"handlelength": 3, "handler_map": {tuple: HandlerTuple(None)}}
-    fig.legend(handles, list(keys), **how)
+    rows = math.ceil(len(handles) / int(fig.get_figwidth() / 1.1))
+    how = {"ncols": math.ceil(len(handles) / rows), "handler_map": {tuple: HandlerTuple(None)}}
+    fig.legend(handles, list(keys), loc="outside upper center", handlelength=3, **how)
 
 
 def beta_ticks(ax, betas, most=8):
@@ -121,24 +120,18 @@ def beta_ticks(ax, betas, most=8):
     ax.set_xticks(betas, [f"{beta:g}" for beta in betas])
 
 
-def log2_ticks(ax, values):
-    ax.set_xscale("log", base=2)
-    ax.set_xticks(values, [f"{value:g}" for value in values])
-    ax.xaxis.set_minor_locator(NullLocator())
-
-
 def draw_intervals(ax, x, table, **style):
     """Means at x with their intervals as bars; table has the columns mean, low, high."""
     (line,) = ax.plot(x, table["mean"], **{"marker": "o", **style})
     ax.vlines(x, table.low, table.high, color=line.get_color(), lw=1.1)
 
 
-def draw_betas(ax, table):
-    """Means with intervals over beta, the index of table, each in its color."""
+def draw_betas(ax, table, most=8):
+    """Means with intervals over beta, the index of table, each in its color, and `beta_ticks`."""
     ax.plot(table.index, table["mean"], color="0.7", zorder=1)
     for beta in table.index:
         draw_intervals(ax, [beta], table.loc[[beta]], **look(beta))
-    beta_ticks(ax, table.index)
+    beta_ticks(ax, table.index, most)
 
 
 def draw_grid(ax, sizes, title):
@@ -164,7 +157,8 @@ def draw_noise(beta, *size, seed=0):
 
 def random_walks(betas):
     """Fig. 1: two-dimensional random walks."""
-    fig, axes = plt.subplots(2, len(betas), figsize=(1.45 * len(betas) + 0.5, 3.3), squeeze=False)
+    size = {"figsize": (1.45 * len(betas) + 0.5, 3.3), "dpi": 200}
+    fig, axes = plt.subplots(2, len(betas), squeeze=False, **size)
     walks = [draw_noise(beta, 4, 2).cumsum(-1).numpy() for beta in betas]  # each (walks, xy, steps)
     for beta, column, walk in zip(betas, axes.T, walks, strict=True):
         for ax, shown in zip(column, (walks, walk), strict=True):
@@ -268,8 +262,14 @@ def compare(runs, x, cells, by=None):
             shifted = table.index + 0.01 * i if x == "beta" else table.index * 2 ** (0.08 * i)
             draw_intervals(ax, shifted, table, **style)
         lines.append((value if isinstance(value, str) else f"{by} = {value}", style))
-    (beta_ticks if x == "beta" else log2_ticks)(ax, sorted(chosen[x].unique()))
-    ax.set_title(extent(chosen, runs))
+    values = sorted(chosen[x].unique())
+    if x == "beta":
+        beta_ticks(ax, values)
+    else:
+        ax.set_xscale("log", base=2)
+        ax.set_xticks(values, values)
+        ax.minorticks_off()
+    ax.set_title(extent(chosen))
     if by:
         legend_above(fig, *lines)
     return fig
@@ -280,15 +280,16 @@ def n_envs_beta_grids(runs):
 
     The first panel's markers show the performance to the sixth power, the others' ranks.
     """
-    grid, ranks, chosen = tables.rank_grids(runs)
-    fig, axes = panels(1 + len(ranks), "n_envs", BETA, width=2.9, height=3.1)
+    grid, ranks, projected, chosen = tables.rank_grids(runs)
+    fig, axes = panels(3, "n_envs", BETA, width=2.9, height=3.1)
     low, high = np.nanmin(grid), np.nanmax(grid)
     draw_grid(axes[0], ((grid - low) / (high - low or 1)) ** 6, "performance, to the sixth power")
-    for ax, (title, order) in zip(axes[1:], ranks.items(), strict=True):
-        rank = order.rank()  # 1 the best, of as many betas as this n_envs has
-        draw_grid(ax, 1 - (rank - 1) / (rank.count() - 1).clip(lower=1), title)
-    made_of = extent(chosen, runs)
-    fig.suptitle(f"larger is better, ring: best of each n_envs; {made_of}", fontsize=9)
+    titles = "rank of performance", "rank projected from the bias"
+    for ax, rank, title in zip(axes[1:], (ranks, projected), titles, strict=True):
+        worst = (rank.max() - 1).clip(lower=1)
+        draw_grid(ax, 1 - (rank - 1) / worst, title)
+    what = "larger is better; ranks and rings, around the best, are of each n_envs"
+    fig.suptitle(f"{what}\n{extent(chosen)}", fontsize=9)
     return fig
 
 
@@ -320,15 +321,14 @@ def learning_curves(runs, curves, by):
             if as_in_study[seeds.index].all():
                 final = paper.get((environment, n_envs, f"{beta:g}"), np.nan)
                 ax.plot(1.05 * end, final, mfc="none", **look(beta))
-        counts = sorted(set(group.groupby("beta").size().tolist()))
-        seeds = f"{' or '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)}"
-        ax.set_title(f"{environment}\nn_envs {n_envs}, {seeds}")
+        counts = sorted(set(group.groupby("beta").size()))
+        seeds = " or ".join(map(str, counts))
+        ax.set_title(f"{environment}\nn_envs {n_envs}, seeds: {seeds}")
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
     sizes = runs.groupby([by, "beta"]).size()
     entries = [("95 % BCa interval", {"lw": 6, "alpha": 0.3})] * int(sizes.max() >= FEW)
     entries += [(f"runs, if fewer than {FEW}", {"lw": 0.5, "alpha": 0.6})] * int(sizes.min() < FEW)
-    betas = sorted(runs.beta.unique())
-    legend_above(fig, *entries, betas=betas, paper=bool(as_in_study.any()))
+    legend_above(fig, *entries, betas=sorted(runs.beta.unique()), paper=as_in_study.any())
     return fig
 
 
@@ -345,17 +345,14 @@ def gsde_vs_beta(runs):
     need(runs.method.nunique() > 1, "runs of gSDE and runs with colored noise")
     shared = [argument for argument in SETTINGS if argument != "method"]
     runs = same_protocol(runs, [*shared, "bootstrap_timeouts"])
-    runs = runs.assign(noise=runs.beta.fillna(np.inf))  # inf: gSDE
-    chosen = comparable(runs, ["noise"], CELL)
-    table = cells_intervals(chosen.assign(z=standardize(chosen)), "z", "noise", CELL)
-    betas, gsde = table.drop(np.inf), table.loc[[np.inf]]
-    fig, [ax] = panels(1, BETA_NAMED, f"standardized performance\n{INTERVAL}", height=3)
-    x = betas.index.max() + 0.5
-    ax.axhline(gsde["mean"].iloc[0], color=INK, ls="--", lw=1)
-    draw_betas(ax, betas)
-    draw_intervals(ax, [x], gsde, color=INK, marker="h", ms=7)
-    ax.set_xticks([*betas.index, x], [*(f"{beta:g}" for beta in betas.index), "gSDE"])
-    ax.set_title(extent(chosen, runs))
+    right = runs.beta.max() + 0.5
+    algorithm = runs.method.map({"ppo": "PPO with colored noise", "gsde": "gSDE"})
+    runs = runs.assign(beta=runs.beta.fillna(right), algorithm=algorithm)
+    fig = compare(runs, "beta", CELL, "algorithm")
+    [ax] = fig.axes
+    ax.axhline(ax.lines[-1].get_ydata()[0], color=INK, ls=":", lw=1)
+    betas = ax.lines[0].get_xdata()
+    ax.set_xticks([*betas, right], [*(f"{beta:g}" for beta in betas), "gSDE"])
     return fig
 
 
@@ -366,12 +363,11 @@ def complex_tasks(runs):
     chosen = pd.concat(comparable(x, ["beta"], ["n_envs"]) for _, x in runs.groupby("environment"))
     fig, axes = panels(chosen.environment.nunique(), BETA, f"performance\n{INTERVAL}", height=2.2)
     for ax, (environment, group) in zip(axes, chosen.groupby("environment"), strict=True):
-        draw_betas(ax, cells_intervals(group, "performance", "beta", ["n_envs"]))
+        draw_betas(ax, cells_intervals(group, "performance", "beta", ["n_envs"]), most=3)
         ax.set_title(environment)
         ax.update_datalim([(0, 0), (0, 1)])  # 0, and 1 for the goal, are in sight
         ax.autoscale_view()
-        beta_ticks(ax, sorted(group.beta.unique()), 3)
-    fig.suptitle(extent(chosen, runs), fontsize=9)
+    fig.suptitle(extent(chosen), fontsize=9)
     return fig
 
 
@@ -382,8 +378,9 @@ def beside_published(averages, runs):
     """
     runs = tables.on_published_scale(runs)
     cells = runs.groupby([*CELL, "beta"])[["final_return", "paper"]].mean()
+    scale = "0 is the environment's lowest published mean, 1 its highest"
     how = {"height": 2.6, "sharey": True}
-    fig, axes = panels(1 + averages.n_envs.nunique(), BETA, "our final return", **how)
+    fig, axes = panels(1 + averages.n_envs.nunique(), scale, "our final return", **how)
     axes[0].axline((0, 0), slope=1, color="0.6", lw=0.9)
     for beta, group in cells.groupby("beta"):
         axes[0].plot(group.paper, group.final_return, **look(beta), ls="", ms=4, alpha=0.8)
@@ -393,13 +390,17 @@ def beside_published(averages, runs):
         ax.plot(table.index, table.paper, color="0.7", ls=":", lw=0.9)
         for beta, paper in table.paper.items():
             ax.plot(beta, paper, **look(beta), mfc="none", ms=8)
-        draw_betas(ax, table)
-        beta_ticks(ax, table.index, 4)
-        ax.set_title(f"n_envs {n_envs}, {environments(int(table.environments.iloc[0]))}")
+        draw_betas(ax, table, most=4)
+        title = f"n_envs {n_envs}, environments: {table.environments.iloc[0]}"
+        ax.set(title=title, xlabel=BETA)
     interval = ("95 % BCa interval", {"lw": 1.1})
     legend_above(fig, interval, betas=sorted(cells.index.unique("beta")), paper=True)
-    fig.supxlabel("0 is the environment's lowest published mean, 1 its highest", size=8)
     return fig
+
+
+def with_runs(table):
+    """Which rows of `coverage` are of a claim that there are runs for."""
+    return (table.verdict != "") & ~table.data.str.fullmatch("no runs[^;]*")
 
 
 def verdicts(table):
@@ -409,9 +410,7 @@ def verdicts(table):
     intervals than the others are cut. Where there is none, the text says why. Left out are claims
     that nothing is tested for, and those that there are no runs for.
     """
-    table = table[table.verdict != ""]
-    unknown = table.data.str.fullmatch("no runs[^;]*")
-    table, open_ones = table[~unknown], unknown.sum()
+    table, tested = table[with_runs(table)], (table.verdict != "").sum()
     need(len(table), "runs of a claim")
     units = {unit: rows for unit, rows in table.groupby("unit", sort=False)}
     counts = [len(rows) for rows in units.values()]
@@ -419,15 +418,14 @@ def verdicts(table):
     fig, axes = plt.subplots(len(units), figsize=size, squeeze=False, height_ratios=counts)
     for ax, (unit, rows) in zip(axes[:, 0], units.items(), strict=True):
         length = rows.high - rows.low
-        seen = rows[~(length > 4 * length.median())]
+        seen = rows[~(length > 2 * length.median())]
         left, right = np.nan_to_num([seen.low.min(), seen.high.max()])
         pad = 0.05 * (right - left) or 1
         ends = ax.set_xlim(min(left, 0) - pad, max(right, 0) + pad)
         for place, row in enumerate(rows.itertuples()):
             style, where = VERDICT_LOOK[row.verdict], {"transform": ax.get_yaxis_transform()}
             if np.isnan(row.low):
-                text = "closed form" if row.runs == "none needed" else row.data
-                text = textwrap.fill(textwrap.shorten(text, 130, placeholder=" ..."), 68)
+                text = textwrap.fill(textwrap.shorten(row.data, 130, placeholder=" ..."), 68)
                 ax.text(0.01, place, text, va="center", color="0.4", size=6, **where)
             else:
                 must = np.clip([row.least, row.most], *ends)
@@ -439,33 +437,27 @@ def verdicts(table):
         ax.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
         ax.grid(visible=False, axis="y")
     title = "95 % intervals, longer where several are compared. A claim can hold only in the gray"
-    fig.suptitle(f"{title}\n({open_ones} more are open for lack of runs)", fontsize=9)
+    fig.suptitle(f"{title}\n(those of {tested} that there are runs for)", fontsize=9)
     return fig
 
 
 # --- The environments -----------------------------------------------------------------------------
 
 
-def first_frame(env_id):
-    """A square picture of the environment's first state."""
-    env = ppo.make_env(ppo.parse_args(["--env-id", env_id]), render_mode="rgb_array")
-    env.reset(seed=1)
-    frame = env.render()
-    env.close()
-    height, width, _ = frame.shape
-    if env_id.startswith("dm_control/"):
-        return frame[:, (width - height) // 2 : (width + height) // 2]
-    margin = max(0, width - height) // 2  # Mountain Car's is wide: square with its own sky
-    return np.pad(frame, ((margin, margin), (0, 0), (0, 0)), mode="edge")
-
-
 def contact_sheet():
-    """A frame of each of the paper's environments."""
+    """The first state of each of the paper's environments, in squares."""
     prepare_rendering()
     fig, axes = plt.subplots(4, 5, figsize=(12, 10.2))
     for ax, env_id in zip(axes.flat, NAMES, strict=True):
-        ax.imshow(first_frame(env_id))
-        ax.set(xticks=[], yticks=[])
+        env = ppo.make_env(ppo.parse_args(["--env-id", env_id]), render_mode="rgb_array")
+        env.reset(seed=1)
+        frame = env.render()
+        env.close()
+        ax.imshow(frame)
+        height, width, _ = frame.shape
+        half = (height if env_id.startswith("dm_control/") else width) / 2  # all of Mountain Car's
+        x, y = (width - 1) / 2, (height - 1) / 2
+        ax.set(xlim=(x - half, x + half), ylim=(y + half, y - half), xticks=[], yticks=[])
         ax.set_title(NAMES[env_id], fontsize=12)
         ax.spines[:].set(visible=True, color="0.7")
     return fig
@@ -477,53 +469,44 @@ def untrained_positions(beta, n_cars=50, n_steps=999, seed=1):
     Returns the positions of n_cars cars, (n_steps + 1, n_cars). A car at the goal stays there.
     """
     torch.manual_seed(seed)
-    policy = ppo.numpy_policy(ppo.Agent(2, 1).actor_mean)
-    env = ppo.make_env(ppo.parse_args(["--env-id", "MountainCarContinuous-v0"]))
-    noise = draw_noise(beta, n_cars, seed=seed).numpy()
-    positions = np.empty((n_steps + 1, n_cars))
-    for car in range(n_cars):
-        obs, _ = env.reset(seed=seed + car)
-        positions[:, car] = obs[0]
-        for step in range(n_steps):
-            action = policy(obs[None])[0] + noise[car, step]  # its standard deviation is 1
-            obs, _, terminated, _, _ = env.step(np.clip(action, -1, 1))
-            positions[step + 1 :, car] = obs[0]
-            if terminated:
-                break
-    return positions
+    limit = ["--max-episode-steps", f"{n_steps + 1}", "--n-steps", f"{n_steps}", "--no-envpool"]
+    args = ppo.parse_args(["--env-id", "MountainCarContinuous-v0", "--n-envs", f"{n_cars}", *limit])
+    envs, noise = ppo.make_vector_env(args, n_cars), ColoredNoiseProcess(beta, n_cars, 1, seed=seed)
+    act, there = ppo.exploration(ppo.Agent(2, 1), noise, args), np.zeros(n_cars, bool)
+    obs, _ = envs.reset(seed=seed)
+    positions = [obs[:, 0].copy()]  # the environments write into obs again
+    for step in range(n_steps):
+        obs, _, terminated, _, _ = envs.step(np.clip(act(obs, step), -1, 1))
+        there |= terminated
+        positions.append(np.where(there, GOAL, obs[:, 0]))
+    return np.array(positions)
 
 
 def animation(betas, n_frames=100, **cars):
     """`untrained_positions` of each beta on the hill, as frames over an episode of 999 steps."""
-    goal, positions = 0.45, [untrained_positions(beta, **cars) for beta in betas]
+    positions = [untrained_positions(beta, **cars) for beta in betas]
     hill, (n_steps, n_cars) = np.linspace(-1.2, 0.6, 200), positions[0].shape
-
-    def height(x):
-        return 0.45 * np.sin(3 * x) + 0.55
-
-    rng = np.random.default_rng(0)
-    lift = 0.04 + 0.14 * rng.random(n_cars)  # or cars at one place would hide each other
+    # Cars are lifted a little, each by its own height, or those at one place would hide each other
+    lift = 0.59 + 0.14 * np.random.default_rng(0).random(n_cars)
     fig, axes = plt.subplots(1, len(betas), figsize=(2.6 * len(betas), 2.1), squeeze=False)
     dots = []
     for ax, beta in zip(axes[0], betas, strict=True):
-        ax.fill_between(hill, height(hill), color="0.85", lw=0)
-        ax.plot([goal] * 2, [0.99, 1.3], color=INK, lw=1.5)
-        ax.fill([goal, goal, goal + 0.12], [1.3, 1.18, 1.24], color="#D55E00", lw=0)
+        ax.fill_between(hill, 0.45 * np.sin(3 * hill) + 0.55, color="0.85", lw=0)
+        ax.plot([GOAL] * 2, [0.99, 1.3], color=INK, lw=1.5)
+        ax.fill([GOAL, GOAL, GOAL + 0.12], [1.3, 1.18, 1.24], color="#D55E00", lw=0)
         dots += ax.plot([], [], "o", color=look(beta)["color"], ms=3.5, alpha=0.7, mew=0)
         ax.set(title="\n", xlim=(-1.2, 0.62), ylim=(0, 1.4), xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
 
     def draw(frame):
-        step = round((n_steps - 1) * frame / (n_frames - 1))
-        for beta, each, dot in zip(betas, positions, dots, strict=True):
-            x = each[step]
-            dot.set_data(x, height(x) + lift)
+        step = round((n_steps - 1) * min(frame / (n_frames - 1), 1))
+        for beta, x, dot in zip(betas, (each[step] for each in positions), dots, strict=True):
+            dot.set_data(x, 0.45 * np.sin(3 * x) + lift)
             name = {0: " (white)", 1: " (pink)", 2: " (red)"}.get(beta, "")
-            there = f"at the goal: {(x >= goal).sum()} of {n_cars}"
+            there = f"at the goal: {(x >= GOAL).sum()} of {n_cars}"
             dot.axes.set_title(f"$\\beta = {beta:g}${name}, step {step}\n{there}")
 
-    pause = [n_frames - 1] * (n_frames // 4)
-    return FuncAnimation(fig, draw, [*range(n_frames), *pause])
+    return FuncAnimation(fig, draw, n_frames * 5 // 4)  # the last frame stays for a while
 
 
 # --- Output ---------------------------------------------------------------------------------------
@@ -533,8 +516,8 @@ def make_all(todo, out):
     """Makes and writes figures (PNG, PDF) and tables (CSV, Markdown, LaTeX).
 
     todo: {name: (function, data, other arguments ...)}; data may be the name of an earlier table.
-    Removes those of earlier data. Returns those made, by name, and a line for each that could not
-    be made.
+    Removes those of earlier data. Returns those made, by name, and lines: what could not be made,
+    and why.
     """
     made, not_made = {}, []
     out.mkdir(parents=True, exist_ok=True)
@@ -554,7 +537,7 @@ def make_all(todo, out):
         if isinstance(made[name], pd.DataFrame):
             tables.save_table(made[name], out, name)
         else:
-            made[name].savefig(out / f"{name}.png", dpi=200)
+            made[name].savefig(out / f"{name}.png")
             made[name].savefig(out / f"{name}.pdf")
             plt.close(made[name])
     return made, not_made
@@ -579,15 +562,15 @@ def averaged(runs):
 def results(methods, curves, betas):
     """What `make_all` is to make of runs, as `select_methods` returns them, and of their curves.
 
-    All is of the first method, except where methods are compared (Sec. A7, A13). betas: those
-    that have learning curves.
+    All is of the first method that has runs, except where methods are compared (Sec. A7, A13).
+    betas: those that have learning curves.
     """
 
     def of(*names):  # runs of several methods
         grids = [study.runs.main_grid(methods[name])[0] for name in names if name in methods]
         return averaged(pd.concat(grids))
 
-    runs = next(iter(methods.values()))
+    runs = next(filter(len, methods.values()))
     grid, _ = study.runs.main_grid(runs)
     colored, every, main = grid[~grid.vanilla], averaged(runs), claims.of_most(averaged(grid))
     white = grid[((grid.beta == 0) | grid.vanilla) & ~grid.env_id.isin(COMPLEX)]
@@ -617,68 +600,46 @@ def results(methods, curves, betas):
         "gsde_vs_beta": (gsde_vs_beta, of("ppo", "gsde")),
         "coverage": (claims.coverage, methods, curves),
         "claims": (verdicts, "coverage"),
-        "beside_published": (beside_published, "average_final_returns", averaged(grid)),
+        "beside_published": (beside_published, "average_final_returns", main),
     }
     lines = colored[colored.beta.isin(betas)]
-    for n_envs, group in lines.groupby("n_envs"):
+    for n_envs, group in averaged(lines).groupby("n_envs"):
         todo[f"learning_curves_n_envs_{n_envs}"] = (learning_curves, group, curves, "environment")
     for environment, group in lines.groupby("environment"):
-        if group.n_envs.nunique() > 1:
+        if group.n_envs.nunique() > 1 or group.env_id.iloc[0] in COMPLEX:
             name = re.sub(r"\W", "", environment.lower().replace(" ", "_"))
             todo[f"learning_curves_{name}"] = (learning_curves, group, curves, "n_envs")
     return todo
 
 
 def draw_results(args):
-    """The command `results`: makes all that the runs allow, and reports what is left out."""
+    """The command `results`: makes all that the runs allow; says what is left out, and why."""
     runs, curves = study.runs.load(args.paths, args.env, args.beta, args.n_envs)
-    methods, left_out = study.runs.select_methods(runs, args.method)
-    runs = methods.pop(args.method)
-    need(len(runs) or args.method == "ppo", f"a complete run of the method {args.method}")
-    grid, dropped = study.runs.main_grid(runs)
-    parts = [part for _, part in grid.groupby(grid.env_id.isin(COMPLEX))]
-    asked = sorted(float(beta) for beta in set(args.beta or []) - {"vanilla"})
-    there = sorted(grid.beta.dropna().unique())
-    three = there if len(there) < 4 else [b for b in there if b in (0, 0.5, 1)] or there[:3]
-    todo = results({args.method: runs, **methods}, curves, asked or three)
-    made, not_made = make_all(todo, args.out)
-    beside = [claims.outside(made["final_returns"])[-1]] if "final_returns" in made else []
-    beside += claims.offset(grid) if "beside_published" in made else []
-    report = {
-        "left out": left_out,
-        "only where n_steps or n_epochs vary, in no other figure or table": dropped,
-        "missing from the grid of these runs": sum(map(study.runs.missing, parts), []),
-        "averaged though evaluated differently": study.runs.mixed_evaluations(runs),
-        "not made": not_made,
-        "final returns beside the published": beside,
-    }
-    file, text = args.out / "report.txt", [f"made: {', '.join(made)}"]
+    methods, left_out = study.runs.select_methods(runs)
+    asked = [float(beta) for beta in args.beta or [] if beta != "vanilla"]
+    made, not_made = make_all(results(methods, curves, asked or [0, 0.5, 1]), args.out)
+    for title, lines in {"runs left out": left_out, "not made": not_made}.items():
+        print("\n  ".join([f"{title}: {len(lines)}", *lines]))
     print(f"{args.out}: {', '.join(made)}")
-    for title, lines in report.items():
-        head, more = f"{title}: {len(lines)}", f"... and {len(lines) - 10} more, see {file}"
-        text += ["\n  ".join([head, *lines])]
-        print("\n  ".join([head, *lines[:10], *[more] * (len(lines) > 10)]))
-    file.write_text("\n".join(text) + "\n")
 
 
 def parse_args():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    commands = parser.add_subparsers(dest="command", required=True)
-    noise = commands.add_parser("noise", help="figures of the noise")
-    results = commands.add_parser("results", help="figures and tables of runs")
-    sheet = commands.add_parser("environments", help="a frame of each of the paper's environments")
-    cars = commands.add_parser("animation", help="untrained policies in Mountain Car, a GIF")
-    study.runs.add_runs(results)
-    results.add_argument("--method", default="ppo", choices=["ppo", "trpo", "a2c"])
-    noise.add_argument("--beta", nargs="+", type=float, default=BETAS, help="default: the study's")
-    cars.add_argument("--beta", nargs="+", type=float, default=[0.0, 0.5, 1.0])
-    folder = {"type": Path, "default": Path("figures"), "help": "folder; replaces earlier figures"}
-    noise.add_argument("--out", **folder)
-    results.add_argument("--out", **folder)
-    sheet.add_argument("--out", type=Path, default=Path("results/environments.png"))
-    cars.add_argument("--out", type=Path, default=Path("results/animation.gif"))
+    add = parser.add_subparsers(dest="command", required=True).add_parser
+    commands = {
+        "noise": (add("noise", help="figures of the noise"), "figures"),
+        "results": (add("results", help="figures and tables of runs"), "figures"),
+        "environments": (add("environments", help="a frame of each"), "results/environments.png"),
+        "animation": (add("animation", help="untrained policies, a GIF"), "results/animation.gif"),
+    }
+    study.runs.add_runs(commands["results"][0])
+    for name, betas in {"noise": BETAS, "animation": [0.0, 0.5, 1.0]}.items():
+        commands[name][0].add_argument("--beta", nargs="+", type=float, default=betas)
+    for command, out in commands.values():
+        note = f"default: {out}; earlier ones are replaced"
+        command.add_argument("--out", type=Path, default=Path(out), help=note)
     return parser.parse_args()
 
 

@@ -92,41 +92,22 @@ def best_beta_per_n_envs(runs):
     return beside_paper(pd.DataFrame(rows).set_index("n_envs"), runs, paper).reset_index()
 
 
-def performance_grid(runs):
-    """Standardized performance, a row per beta and a column per n_envs; NaN where there is none.
-
-    Averaged over the environments that have all the combinations found, each weighing the same.
-    Returns the grid and the runs that it is made of.
-    """
-    runs = comparable(runs, ["n_envs", "beta"], ["environment"])
-    runs = runs.assign(z=standardize(runs))
-    cells = runs.groupby(["beta", "n_envs", "environment"]).z.mean()
-    return cells.groupby(["beta", "n_envs"]).mean().unstack(), runs
-
-
 def rank_grids(runs):
-    """Performance by beta and n_envs, its ranks, and ranks projected from the bias of the noise.
+    """Standardized performance, its ranks, and ranks projected from the bias of the noise.
 
-    Projected by our best betas and, where the runs have the study's protocol, by the paper's.
-    Returns `performance_grid`'s grid, {title: grid of ranks, 1 the best}, projections that are the
-    same once, and the runs that all is made of.
+    Averaged over the environments that have all combinations of beta and n_envs found, each
+    weighing the same; projected from the best betas here. Returns three tables with a row per beta
+    and a column per n_envs, 1 the best rank, NaN where there is none, and the runs that they are
+    made of.
     """
     need(runs.beta.nunique() > 1, "at least two betas")
-    grid, runs = performance_grid(runs)
+    runs = comparable(runs, ["n_envs", "beta"], ["environment"])
     lengths = runs.noise_seq_len.unique()
     need(len(lengths) == 1, "one --noise-seq-len, of all environments: the projection goes by it")
-    best = {"our": grid.idxmax()}
-    if not differences(runs).any():
-        best["the paper's"] = published("best_beta_per_n_envs").set_index("n_envs").best_beta
-    projected = {}
-    for whose, betas in best.items():
-        ranks = projected_ranks(betas, grid.index, grid.columns, int(lengths[0]))
-        projected[whose] = ranks.where(grid.notna())
-    if len(best) > 1 and projected["our"].equals(projected["the paper's"]):
-        projected = {"our and the paper's": projected["our"]}
-    titles = [f"rank projected from the bias,\nby {whose} best $\\beta$" for whose in projected]
-    ranks = {"rank of performance within n_envs": (-grid).rank()}
-    return grid, ranks | dict(zip(titles, projected.values(), strict=True)), runs
+    cells = standardize(runs).groupby([runs.beta, runs.n_envs, runs.environment]).mean()
+    grid = cells.groupby(["beta", "n_envs"]).mean().unstack()
+    projected = projected_ranks(grid.idxmax(), grid.index, grid.columns, int(lengths[0]))
+    return grid, (-grid).rank(), projected.where(grid.notna()).rank(), runs
 
 
 def projected_ranks(best, betas, n_envs, seq_len=1000):
@@ -189,12 +170,11 @@ def final_return_per_beta(table):
     for key, cells in table.groupby(CELL):
         row = dict(zip(CELL, key, strict=True)) | {"runs": cells.runs.sum()}
         for cell in cells.to_dict("records"):
-            interval = "" if pd.isna(cell["low"]) else " [{low:z.1f}, {high:z.1f}]".format(**cell)
             missed = cell["in_interval"] == "no" and cell["runs"] >= FEW
-            outside = " (outside)" if missed else ""
-            paper = "" if pd.isna(cell["paper"]) else f"{cell['paper']:z.1f}{outside}"
-            row[f"beta {cell['beta']}"] = f"{cell['mean']:z.1f}{interval}"
-            row[f"paper, {cell['beta']}"] = paper
+            ours = "{mean:z.1f} [{low:z.1f}, {high:z.1f}]".format(**cell)
+            row[f"beta {cell['beta']}"] = ours.removesuffix(" [nan, nan]")
+            paper = f"{cell['paper']:z.1f}{' (outside)' * missed}"
+            row[f"paper, {cell['beta']}"] = paper.replace("nan", "")
         if "differs" in cells:
             row["differs"] = "; ".join(sorted(set(cells.differs) - {""}))
         rows.append(row)
@@ -237,7 +217,8 @@ def average_final_returns(runs):
 
 
 def markdown(table):
-    """A table of texts in Markdown."""
+    """A table in Markdown. table: a DataFrame or a list of rows, dicts, of texts."""
+    table = pd.DataFrame(table).astype(str)
     rows = [table.columns, ["---"] * table.shape[1], *table.to_numpy()]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
@@ -245,20 +226,12 @@ def markdown(table):
 def save_table(table, out, name):
     """Writes NAME.csv in full precision, NAME.md and NAME.tex rounded, to the folder `out`."""
 
-    def text(column, value):
+    def text(value):
         if isinstance(value, str) or pd.isna(value):
             return value if isinstance(value, str) else ""
-        if column.startswith("p_") and value < 0.01:
-            return "<0.01"
-        whole = isinstance(value, int) or column in ("runs", "environments", "cells")
-        return f"{value:g}" if column.endswith("beta") or whole else f"{value:z.2f}"
+        return f"{round(float(value), 2):g}" if abs(value) >= 0.01 else f"{value:.2g}"
 
-    columns = {column: [text(column, x) for x in table[column].tolist()] for column in table}
-    shown = pd.DataFrame(columns)
-    long = [shown[column].map(len).max() > 40 for column in shown]
-    how = {"escape": True, "longtable": True}
-    how["column_format"] = "".join("p{5cm}" if each else "l" for each in long)
-    latex = shown.to_latex(index=False, **how).replace("<", "$<$")
+    shown = table.map(text)
     table.to_csv(out / f"{name}.csv", index=False)
     (out / f"{name}.md").write_text(markdown(shown))
-    (out / f"{name}.tex").write_text(latex)
+    shown.to_latex(out / f"{name}.tex", index=False, escape=True)

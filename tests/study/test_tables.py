@@ -56,7 +56,7 @@ def test_averages_are_of_comparable_cells_that_weigh_the_same(made_up):
     row = tables.best_beta_per_env(runs).iloc[0]
     assert row[["best_beta", "beta_0.5", "runs"]].tolist() == [0.5, "comparable", 20]
     assert tables.best_beta_per_n_envs(runs).best_beta.tolist() == [0.5, 0.5]
-    grid, shown = tables.performance_grid(runs)
+    grid, _, _, shown = tables.rank_grids(runs)
     assert len(shown) == 24 and grid.notna().sum().tolist() == [4, 2]
     assert grid.idxmax().tolist() == [0.5, 0.5]
     table = tables.final_return_and_performance(runs).iloc[0]
@@ -144,8 +144,8 @@ def test_projected_ranks_from_the_published_best_betas():
 
 
 def test_saved_tables(tmp_path):
-    table = pd.DataFrame({"environment": ["A_b"], "beta": [0.5], "p_0.5": [0.001], "x": [np.nan]})
-    tables.save_table(table.assign(runs=3, mean=1.23456), tmp_path, "t")
-    assert (tmp_path / "t.csv").read_text().splitlines()[1] == "A_b,0.5,0.001,,3,1.23456"
-    assert (tmp_path / "t.md").read_text().splitlines()[2] == "| A_b | 0.5 | <0.01 |  | 3 | 1.23 |"
-    assert r"A\_b & 0.5 & $<$0.01 &  & 3 & 1.23" in (tmp_path / "t.tex").read_text()
+    table = pd.DataFrame({"environment": ["A_b"], "p": [0.00123], "runs": [3], "x": [np.nan]})
+    tables.save_table(table.assign(mean=1.23456), tmp_path, "t")
+    assert (tmp_path / "t.csv").read_text().splitlines()[1] == "A_b,0.00123,3,,1.23456"
+    assert (tmp_path / "t.md").read_text().splitlines()[2] == "| A_b | 0.0012 | 3 |  | 1.23 |"
+    assert r"A\_b & 0.0012 & 3 &  & 1.23" in (tmp_path / "t.tex").read_text()
