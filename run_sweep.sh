@@ -71,55 +71,47 @@ report() { # lists what failed, and counts; true where all runs are complete
   ((complete == ${#folders[@]}))
 }
 
-submit() { # the script's arguments: submits what is left as a job array
-  local i left=() max n_tasks job
-  for i in "${!folders[@]}"; do is_left "${folders[i]}" && left+=("$i"); done
-  ((${#left[@]})) || { echo "$preset: nothing to do"; return; }
-  if [[ -z $runs_per_task ]]; then
-    max=$(scontrol show config | awk '$1 == "MaxArraySize" { print $3 }')
-    [[ -n $max ]] || die "scontrol does not tell MaxArraySize: is this a Slurm cluster?"
-    runs_per_task=$(((${#left[@]} + max - 1) / max))
-    ((runs_per_task >= 4)) || runs_per_task=4
-  fi
-  n_tasks=$(((${#left[@]} + runs_per_task - 1) / runs_per_task))
+submit() { # the script's arguments: submits a job array, each task of which is this very command
+  local folder left=0 job
+  for folder in "${folders[@]}"; do is_left "$folder" && left=$((left + 1)); done
+  ((left)) || { echo "$preset: nothing to do"; return; }
   mkdir -p "$runs_dir/slurm" || exit
-  # A task is this very command for its part of the list. USR1 comes a minute before the time limit.
+  # USR1 comes a minute before the time limit
   # shellcheck disable=SC2086 # $sbatch is a list of options
-  job=$(sbatch --parsable --job-name="$preset" --array="0-$((n_tasks - 1))" --requeue \
-    --open-mode=append --signal=B:USR1@60 --output="$runs_dir/slurm/%A_%a.log" $sbatch <<END
+  job=$(sbatch --parsable --job-name="$preset" --array="1-$slurm" --requeue --open-mode=append \
+    --signal=B:USR1@60 --output="$runs_dir/slurm/%A_%a.log" $sbatch <<END
 #!/bin/bash
-left=(${left[*]})
-exec env $(printf '%q ' "PYTHON=$python" bash "$scripts/run_sweep.sh") \
-  --only "\${left[*]:SLURM_ARRAY_TASK_ID * $runs_per_task:$runs_per_task}" $(printf '%q ' "$@")
+exec env $(printf '%q ' "PYTHON=$python" bash "$scripts/run_sweep.sh" "$@")
 END
   ) || exit
-  echo "${#left[@]} runs in $n_tasks tasks, submitted as job ${job%%;*}; to stop: scancel" \
-    "${job%%;*}; to go on: the same command; messages: $runs_dir/slurm"
+  echo "$left runs in $slurm tasks, submitted as job ${job%%;*}; to stop: scancel ${job%%;*};" \
+    "to go on: the same command; messages: $runs_dir/slurm"
 }
 
 main() {
-  local python=${PYTHON:-python} scripts sweep go_on
-  local mode preset runs_dir jobs retry_failed sbatch runs_per_task folders commands
+  local python=${PYTHON:-python} scripts sweep go_on task
+  local preset runs_dir jobs retry_failed slurm sbatch folders commands
   scripts=$(dirname "$(realpath "$0")")
   export PYTHONPATH=$scripts${PYTHONPATH:+:$PYTHONPATH}
   sweep=$(PYTHONSAFEPATH=1 "$python" -m study.sweep "$@") || exit # no study in the current folder
-  [[ $sweep == mode=* ]] || { printf '%s\n' "$sweep"; exit; }
+  [[ $sweep == preset=* ]] || { printf '%s\n' "$sweep"; exit; }
   eval "$sweep"
+  task=${slurm:+${SLURM_ARRAY_TASK_ID:-}} # in a task of the job array
   command -v flock >/dev/null || die "there is no flock here (on macOS: brew install flock)"
-  [[ $mode == task || -z $retry_failed ]] || printf '%s/failed\0' "${folders[@]}" | xargs -0 rm -f
-  [[ $mode != slurm ]] || { submit "$@"; exit; }
+  [[ $task || -z $retry_failed ]] || printf '%s/failed\0' "${folders[@]}" | xargs -0 rm -f
+  [[ $task || -z $slurm ]] || { submit "$@"; exit; }
   "$python" "$scripts/ppo_colored_continuous.py" --help >/dev/null ||
     die "$python cannot run ppo_colored_continuous.py; PYTHON=... names the interpreter"
 
   go_on=$(printf ' %q' ${PYTHON:+"PYTHON=$PYTHON"} "$0" "$@")
   trap 'end_runs; echo "stopped; to go on:$go_on"; exit 130' INT
   trap 'end_runs; echo "stopped; to go on:$go_on"; exit 143' TERM HUP
-  if [[ $mode == task ]]; then # its own id: that of the job alone is the whole array's
-    trap 'end_runs; scontrol requeue "${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"; exit' USR1
+  if [[ $task ]]; then # its own id: that of the job alone is the whole array's
+    trap 'end_runs; scontrol requeue "${SLURM_ARRAY_JOB_ID}_$task"; exit' USR1
   fi
   echo "$preset: ${#folders[@]} runs, $jobs at a time"
   work pass
-  [[ $mode == task ]] || work wait
-  report
+  [[ $task ]] || work wait
+  report || [[ $task ]] # a task is done when the others have the rest
 }
 main "$@"

@@ -27,16 +27,14 @@ how to run it
   --print             print one command per line and nothing else, for GNU parallel or a queue
   --status            say how many are done, running, failed and to do, and the time left
   --retry-failed      take up failed runs again, from their last checkpoint
-  --slurm             submit what is to do as a job array
+  --slurm N           submit a job array of N tasks, which share the runs
   --sbatch="OPTIONS"  for sbatch: "--partition=cpu --time=12:00:00 --mem-per-cpu=2G"; with
-                      --cpus-per-task=8 a task does its runs 8 at a time
-  --runs-per-task K   runs in a task of the array (4, or more where the array would be too large)
+                      --cpus-per-task=8 a task does 8 runs at a time
 
 PYTHON names the interpreter (python), as in PYTHON=.venv/bin/python ./run_sweep.sh quick
 Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was. On a
 second machine that sees the runs folder it shares the work. A run's output is in log.txt in its
-folder. A failed run has its exit code and error in the file "failed" there; it is not tried again
-without --retry-failed.
+folder. A failed run has its exit code and error in the file "failed" there.
 Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
 """
 
@@ -89,11 +87,7 @@ def numbers(text):
 
 def betas(text):
     """Noise colors: numbers, or auto. -0 is 0, which is not a second run."""
-    found = [word if word == "auto" else float(word) + 0 for word in words(text)]
-    for beta in found:
-        if beta != "auto" and float(f"{beta:g}") != beta:
-            raise argparse.ArgumentTypeError(f"{beta} has more digits than a folder's name shows")
-    return found
+    return [word if word == "auto" else f"{float(word) + 0:g}" for word in words(text)]
 
 
 def environments(text):
@@ -121,13 +115,12 @@ def parse_args(argv):
     add("--exp-name")
     add("--runs-dir", default="runs")
     add("-j", type=positive, dest="jobs")
-    add("--retry-failed", action="store_const", const="yes")
+    add("--retry-failed", action="store_true")
     add("--sbatch")
-    add("--runs-per-task", type=positive)
-    add("--only", type=numbers)  # for a task of Slurm: its part of the list, as indices
-    mode = parser.add_mutually_exclusive_group()
-    for name in ("print", "status", "slurm"):
-        mode.add_argument(f"--{name}", dest="mode", action="store_const", const=name)
+    add = parser.add_mutually_exclusive_group().add_argument
+    add("--print", action="store_true")
+    add("--status", action="store_true")
+    add("--slurm", type=positive)
 
     end = argv.index("--") if "--" in argv else len(argv)
     args = parser.parse_args(argv[:end])
@@ -141,7 +134,6 @@ def parse_args(argv):
         setattr(args, axis, getattr(args, axis, None) or values)
     if args.preset == "gymnasium" and set(args.n_envs) - {*GYMNASIUM_SIZES}:
         parser.error("gymnasium has --n-envs 1 and 32")
-    args.mode = "task" if args.only else args.mode or "local"
     return args
 
 
@@ -151,12 +143,8 @@ def run_folder(runs_dir, exp_name, env_id, beta, n_envs, seed):
     beta: a number or "auto", or what is in place of colored noise: "vanilla" or "gsde".
     """
     env = re.sub(r"[/:\\]", "_", env_id)
-    noise = beta if beta in ("vanilla", "gsde") else f"beta_{text_of(beta)}"
+    noise = beta if beta in ("vanilla", "gsde") else f"beta_{beta}"
     return Path(runs_dir, exp_name, env, noise, f"n_envs_{n_envs}", f"seed_{seed}")
-
-
-def text_of(beta):
-    return beta if isinstance(beta, str) else f"{beta:g}"
 
 
 def run(args, seed, env_id, n_envs, beta, n_epochs, method):
@@ -169,7 +157,7 @@ def run(args, seed, env_id, n_envs, beta, n_epochs, method):
         path = f"PYTHONPATH={os.environ.get('PYTHONPATH', ROOT)}"  # and not the current folder:
         program = ["env", path, "PYTHONSAFEPATH=1", python, "-m", "study.methods", method]
         name = f"{args.exp_name}_{method}" if args.exp_name else method
-    flags = {"vanilla": ["--vanilla"], "gsde": []}.get(beta, ["--beta", text_of(beta)])
+    flags = {"vanilla": ["--vanilla"], "gsde": []}.get(beta, ["--beta", f"{beta}"])
     n_steps = UPDATE_SIZE // n_envs
     if args.preset == "n_steps" and n_steps != SETTINGS["n_steps"]:
         flags += ["--n-steps", str(n_steps)]
@@ -194,18 +182,15 @@ def list_runs(args):
     Seeds come outermost, so that a sweep cut short has whole grids.
     """
     combinations = itertools.product(*(getattr(args, axis) for axis in GRID))
-    runs = list(dict.fromkeys(run(args, *values) for values in combinations))
-    return [runs[i] for i in args.only] if args.only else runs
+    return list(dict.fromkeys(run(args, *values) for values in combinations))
 
 
 def for_bash(args, runs):
     """Assignments: the sweep, for run_sweep.sh to evaluate."""
-    if args.mode == "task":
-        args.jobs = int(os.environ.get("SLURM_CPUS_PER_TASK", 1))
-    elif not args.jobs:
-        on_linux = hasattr(os, "sched_getaffinity")
-        args.jobs = len(os.sched_getaffinity(0)) if on_linux else os.cpu_count()
-    names = ["mode", "preset", "runs_dir", "jobs", "retry_failed", "sbatch", "runs_per_task"]
+    on_linux = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if on_linux else os.cpu_count()
+    args.jobs = args.jobs or (os.environ.get("SLURM_CPUS_PER_TASK", 1) if args.slurm else cores)
+    names = ["preset", "runs_dir", "jobs", "retry_failed", "slurm", "sbatch"]
     lines = [f"{name}={shlex.quote(str(getattr(args, name) or ''))}" for name in names]
     lines += ["folders=(", *(shlex.quote(folder) for folder, _ in runs), ")"]
     return lines + ["commands=(", *(shlex.quote(command) for _, command in runs), ")"]
@@ -214,10 +199,10 @@ def for_bash(args, runs):
 def main():
     args = parse_args(sys.argv[1:])
     runs = list_runs(args)
-    if args.mode == "print":
+    if args.print:
         lines = [command for _, command in runs]
-    elif args.mode == "status":
-        lines = status([folder for folder, _ in runs], args.preset)
+    elif args.status:
+        lines = [status([folder for folder, _ in runs], args.preset)]
     else:
         lines = for_bash(args, runs)
     print("\n".join(lines))

@@ -245,28 +245,31 @@ def test_run_that_was_started_by_hand_is_left_alone(sweep):
 # --- Slurm
 
 
-def test_slurm_tasks_are_parts_of_what_is_left(sweep):
+def test_slurm_tasks_share_what_is_left(sweep):
     """Without Slurm: what sbatch is given, run as Slurm would."""
-    sweep.prepare("", seeds="1 2 3 4 5 6")
+    sweep.prepare("time.sleep(0.1)", seeds="1 2 3 4 5 6")
     tools, batch, options = (sweep.folder / name for name in ("tools", "batch", "options"))
     tools.mkdir()
-    sbatch = f"cat >{batch}; echo $* >{options}; echo 7"
-    for tool, says in ("sbatch", sbatch), ("scontrol", "echo MaxArraySize = 1"):
-        (tools / tool).write_text(f"#!/bin/sh\n{says}\n")
-        (tools / tool).chmod(0o755)
+    (tools / "sbatch").write_text(f"#!/bin/sh\ncat >{batch}; echo $* >{options}; echo 7\n")
+    (tools / "sbatch").chmod(0o755)
     sweep.env["PATH"] = f"{tools}:{os.environ['PATH']}"
-    sweep.folders[1].mkdir(parents=True)
-    (sweep.folders[1] / "summary.json").touch()
-    args = [*sweep.args, "--slurm", "--sbatch=--time=1:00 --mem=2G"]
-    assert sweep.run(*args)[1].startswith("5 runs in 1 tasks, ")  # no larger array is allowed
-    args += ["--runs-per-task", "2", "--", "--note", "it's"]
+    done, failed, *left = sweep.folders
+    for folder, file in (done, "summary.json"), (failed, "failed"):
+        folder.mkdir(parents=True)
+        (folder / file).touch()
+    args = [*sweep.args, "--slurm", "2", "--sbatch=--time=1:00 --mem=2G", "--", "--note", "it's"]
     code, output = sweep.run(*args)
-    assert code == 0 and output.startswith("5 runs in 3 tasks, submitted as job 7;"), output
-    assert "--array=0-2 " in options.read_text() and "--time=1:00 --mem=2G" in options.read_text()
-    for task, done in enumerate(([0, 2], [0, 2, 3, 4], [0, 2, 3, 4, 5])):
-        env = {**sweep.env, "SLURM_ARRAY_TASK_ID": str(task)}
-        assert subprocess.run(["bash", batch], env=env, cwd=sweep.folder).returncode == 0
-        assert [starts(folder) for folder in sweep.folders] == [int(i in done) for i in range(6)]
+    assert code == 0 and output.startswith("4 runs in 2 tasks, submitted as job 7;"), output
+    assert "--array=1-2 " in options.read_text() and "--time=1:00 --mem=2G" in options.read_text()
+    how = {"cwd": sweep.folder, "stdout": subprocess.PIPE, "text": True}
+    tasks = [
+        subprocess.Popen(["bash", batch], env={**sweep.env, "SLURM_ARRAY_TASK_ID": task}, **how)
+        for task in "12"
+    ]
+    outputs = [task.communicate(timeout=60)[0] for task in tasks]
+    assert [task.returncode for task in tasks] == [0, 0]
+    assert all("\ncomplete (" in output for output in outputs)  # each did a share
+    assert [starts(folder) for folder in sweep.folders] == [0, 0, 1, 1, 1, 1]
     assert "nothing to do" in sweep.run(*args)[1]
 
 
@@ -276,19 +279,19 @@ def test_slurm_requeues_one_task_of_an_array(sweep):
         assert os.environ.get("REQUIRE_SLURM") != "1", "REQUIRE_SLURM=1, but no Slurm answers"
         pytest.skip("no Slurm answers (tests/slurm.sh starts one)")
     sweep.prepare(FIRST_TIME_WAIT, seeds="1 2")
-    code, output = sweep.run(*sweep.args, "--slurm", "--runs-per-task", "1")
+    code, output = sweep.run(*sweep.args, "--slurm", "2")
     assert code == 0, output
     job = re.search("as job ([0-9]+);", output)[1]
     try:
         wait_for(lambda: all(is_running(folder) for folder in sweep.folders))
-        subprocess.run(["scontrol", "requeue", f"{job}_0"], check=True)
-        wait_for(lambda: is_complete(sweep.folders[0]))
-        assert is_running(sweep.folders[1])
+        subprocess.run(["scontrol", "requeue", f"{job}_1"], check=True)
+        wait_for(lambda: any(is_complete(folder) for folder in sweep.folders))
+        assert any(is_running(folder) for folder in sweep.folders)
         # What Slurm sends to the batch shell a minute before the time limit; here to the last task
         # of the array, which has the array's own job id
-        subprocess.run(["scancel", "--batch", "--signal=USR1", f"{job}_1"], check=True)
-        wait_for(lambda: is_complete(sweep.folders[1]))
+        subprocess.run(["scancel", "--batch", "--signal=USR1", f"{job}_2"], check=True)
+        wait_for(lambda: all(is_complete(folder) for folder in sweep.folders))
     finally:
         subprocess.run(["scancel", job], check=True)
     assert [starts(folder) for folder in sweep.folders] == [2, 2]
-    assert "nothing to do" in sweep.run(*sweep.args, "--slurm")[1]
+    assert "nothing to do" in sweep.run(*sweep.args, "--slurm", "2")[1]

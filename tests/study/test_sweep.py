@@ -79,16 +79,9 @@ def test_other_methods():
     assert [flags(command, "--beta")[0] for _, command in found] == ["0.5", "0.5", None]
 
 
-def test_part_of_the_list():
-    whole = runs("quick")
-    assert runs("quick --slurm --only '1 3'") == [whole[1], whole[3]]
-    # A task that submitted again would do so without end
-    assert sweep.parse_args(["quick", "--slurm", "--only", "0"]).mode == "task"
-
-
 WRONG = """
-mane | main 4 | main --foo | main --envs PontUMaze | main --betas 0,5 | main --betas 1.23456789
-main --seeds ' ' | main --n-envs 1.5 | main -j 0 | main --print --slurm
+mane | main 4 | main --foo | main --envs PontUMaze | main --betas 0,5 | main --seeds ' '
+main --n-envs 1.5 | main -j 0 | main --print --slurm 2 | main --slurm 0 | gymnasium --n-envs 4
 vanilla --betas 0 | main -- --seed 3 | n_steps -- --n-steps=5
 """
 
