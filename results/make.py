@@ -28,7 +28,7 @@ from study.statistics import contrast, interval, mean_interval, standardize
 from study.tables import final_return_per_beta, final_returns, markdown
 
 RESULTS = Path(__file__).parent
-PAGES = [RESULTS / "README.md", RESULTS / "notes.md"]
+PAGES = [RESULTS.parent / "README.md", RESULTS / "README.md", RESULTS / "notes.md"]
 FILES = ["reproduction.csv", "study.csv", "slices.csv", "methods.csv"]
 FIGURES = [  # names as in plot.py, of these files
     *("claims", "performance_vs_beta", "n_envs_beta_grids", "beside_published", "beta0_vs_vanilla"),
@@ -119,6 +119,28 @@ def counts():
     return f"Of {n} claims, {holds} hold, {fails} do not, {unknown} are open.\n"
 
 
+def ahead():
+    """In which environments beta 0.5 is ahead of white noise, and behind."""
+    runs = main_runs()
+    ahead, behind, found, _ = claims.ahead_in(runs.assign(z=standardize(runs)), 0.5)
+    n_runs, rest = sum(x["runs"] for x in found.values()), len(found) - len(ahead) - len(behind)
+    text = f"- Compared with white noise in the paper's {len(found)} environments, {n_runs} runs: "
+    text += f"β = 0.5 learns more in {len(ahead)} ({', '.join(ahead)}), less in {len(behind)} "
+    return f"{text}({', '.join(behind)}). In the other {rest} these runs cannot tell.\n"
+
+
+def goals():
+    """How many runs of Mountain Car end at the goal, which gives 100 where all else costs."""
+    made = complete("reproduction.csv", "study.csv", "new_seeds.csv")
+    made = made[(made.environment == "Mountain Car") & made.beta.isin(["0", "0.5", "1"])]
+    parts = []
+    for n_envs in (1, 4, 32):
+        cells = [made[(made.n_envs == n_envs) & ((made.beta == "0") == white)] for white in (0, 1)]
+        ours, white = (f"{(x.final_return > 0).sum()} of {len(x)}" for x in cells)
+        parts.append(f"{ours} against {white} with n_envs {n_envs}")
+    return f"Runs that end at its goal, β = 0.5 or 1 against white: {', '.join(parts)}.\n"
+
+
 def lead():
     """The lead of beta 0.5 over white noise, ours in performance, the paper's in final return."""
     paper = published("final_return_per_beta")
@@ -139,6 +161,20 @@ def lead():
             row[f"paper, {name}"] = f"{contrast(cells, **weights)['mean']:z.2f}"
         rows.append(row)
     return markdown(rows)
+
+
+def leads():
+    """Our leads of `lead`, in a sentence."""
+    parts = []
+    for n_envs in ([4], [1, 4, 32]):
+        part = colored(n_envs)
+        found = contrast(
+            part.assign(z=standardize(part)), {0.5: 1, 0: -1}, "beta", CELL[: len(n_envs)]
+        )
+        low, high = interval(found)
+        where = f"{found['environments']} environments, n_envs {', '.join(map(str, n_envs))}"
+        parts.append(f"{found['mean']:z.2f} [{low:z.2f}, {high:z.2f}] ({where})")
+    return f"Its lead over white noise, in standard deviations: {' and '.join(parts)}: open.\n"
 
 
 def verdicts():
@@ -202,7 +238,19 @@ def speed():
     )
 
 
-TABLES = [runs, counts, lead, final_returns_of_four, offset, speed, verdicts, planned]
+TABLES = [
+    runs,
+    ahead,
+    goals,
+    leads,
+    counts,
+    lead,
+    final_returns_of_four,
+    offset,
+    speed,
+    verdicts,
+    planned,
+]
 TABLES += [settings, friction]
 TABLES = {make.__name__: make for make in TABLES}
 
