@@ -73,7 +73,7 @@ def parse_args(argv=None, **defaults):
     add("--normalize-obs", action=flag, default=False, help="by the mean and std up to now")
     add("--normalize-rewards", action=flag, default=False, help="by the std of returns up to now")
     add = parser.add_argument_group("colored noise").add_argument
-    betas = "0 white, 1 pink, 2 red; one, or one per action dimension; auto: for n_envs * n_steps"
+    betas = "0 white, 1 pink, 2 red; one, or one per action dimension; auto: by n_envs * n_steps"
     add("--beta", type=beta_or_auto, nargs="+", default=[0.5], help=betas)
     add("--noise-seq-len", type=int, default=1000, help="T, steps until new sequences are drawn")
     add("--vanilla", action="store_true", help="white noise of torch.randn, as in ordinary PPO")
@@ -135,10 +135,11 @@ def layer_init(layer, gain=2**0.5):
 
 
 class Agent(nn.Module):
-    """Separate actor and critic. Any layers will do but BatchNorm and Dropout.
+    """Separate actor and critic. All layers work but BatchNorm and Dropout, which act differently
+    in training. Parameters with requires_grad=False are not learned.
 
-    Parameters with requires_grad=False are not learned. Rollout and evaluation call actor_mean, std
-    and critic: what is added in forward alone does not act.
+    Rollout and evaluation call actor_mean, std and critic: an edit in forward alone changes no
+    action.
     """
 
     def __init__(self, obs_dim, action_dim):
@@ -167,8 +168,8 @@ class Agent(nn.Module):
 
         Returns logprobs (batch,), entropy () and values (batch,).
         """
-        # The density of a single step. That eps is correlated over time does not enter: each eps is
-        # still Gaussian by itself, and PPO's objective is made of single steps (docs/lesson.md).
+        # The density of a single step, as if eps were white. Each eps is Gaussian by itself, and
+        # PPO's objective is made of single steps. The paper does so, too (docs/lesson.md).
         policy = Normal(self.actor_mean(obs), self.std(), validate_args=False)
         logprobs, entropy = policy.log_prob(actions).sum(-1), policy.entropy().sum(-1).mean()
         return logprobs, entropy, self.critic(obs).squeeze(-1)
@@ -177,9 +178,9 @@ class Agent(nn.Module):
 def numpy_policy(actor):
     """The module `actor` as a function from numpy to numpy: obs (n, obs_dim) -> (n, action_dim).
 
-    For networks this small numpy is quicker than torch: 6 us for 4 rows, not 31. With other layers
-    than those below the module itself is called, in eval mode. Either way the weights are copied,
-    so call numpy_policy again when the module has learned.
+    This is for speed only: for networks this small numpy takes 6 us for 4 rows, torch 31. With
+    other layers than those below the module itself is called, in eval mode. Either way the weights
+    are copied, so call numpy_policy again when the module has learned.
     """
     known = {nn.Linear: lambda x, weight, bias=0: x @ weight + bias}
     known |= {nn.Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}
@@ -313,7 +314,7 @@ def collect(agent, act, envs, last_obs, so_far, args, bar):
         clipped = np.clip(actions[t], space.low, space.high)
         obs[t + 1], rewards[t], terminated, truncated, infos = envs.step(clipped)
         dones[t] = terminated | truncated
-        so_far[0] += infos.get("raw_rewards", rewards[t])
+        so_far[0] += infos.get("raw_rewards", rewards[t])  # before --normalize-rewards
         so_far[1] += 1
         for i in np.flatnonzero(dones[t]):
             episodes.append(so_far[:, i].tolist())
@@ -375,7 +376,8 @@ def ppo_loss(agent, minibatch, args):
     minibatch: obs (batch, obs_dim), actions (batch, action_dim), logprobs, advantages, returns and
     values (batch,). Returns the loss and a dict of metrics to log.
     """
-    obs, actions, old_logprobs, advantages, returns, _ = minibatch  # old values: for value clipping
+    # The last, the old values, is not used: it is there for those who add value clipping
+    obs, actions, old_logprobs, advantages, returns, _ = minibatch
     logprobs, entropy, values = agent(obs, actions)
     if args.normalize_advantage and len(advantages) > 1:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -395,9 +397,9 @@ def ppo_loss(agent, minibatch, args):
 def loss_gradients(loss_function, agent, minibatch, args):
     """Returns the gradients of the loss, scaled down to --max-grad-norm, and metrics to log.
 
-    This is loss.backward() and clip_grad_norm_(). In this form torch.compile makes one graph of
-    both and of the loss: a third of the time of ordinary PyTorch (--no-compile). What is not a
-    tensor is a constant of the graph. If it changes, the graph is compiled again: 10 seconds.
+    This is loss.backward() and clip_grad_norm_(), in a form of which torch.compile makes one graph,
+    with the loss: a third of the time of --no-compile. A Python number that changes, such as one in
+    args, takes effect, but the graph is then compiled again: 10 seconds.
     """
     loss, metrics = loss_function(agent, minibatch, args)
     # materialize_grads: zeros for parameters that the loss does not use
@@ -624,7 +626,8 @@ class Run:
 
 # --- The whole run
 def make_seeds(n, *key):
-    """n independent seeds below 2^32, determined by the integers of the key."""
+    """n independent seeds below 2^32, determined by the key: args.seed, a number for the purpose (0
+    networks and noise, 1 environments, 2 evaluation, 3 global generators), and the step."""
     return np.random.SeedSequence(key).generate_state(n).tolist()
 
 

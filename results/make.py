@@ -209,10 +209,8 @@ def settings():
 
 
 def planned():
-    """The answers to the questions of plans.md that there are runs for."""
-    found = [(question.__doc__, question()) for question in questions.QUESTIONS]
-    parts = [f"{doc}\n\n{markdown(table)}" for doc, table in found if table is not None]
-    return "\n".join(parts) or "No runs yet.\n"
+    """The answers to the questions of plans.md."""
+    return questions.answers()
 
 
 def friction():
