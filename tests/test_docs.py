@@ -25,7 +25,7 @@ README = (ROOT / "README.md").read_text()
 OWN = (ROOT / "docs" / "environments.md").read_text()
 SWEEPS = (ROOT / "docs" / "sweeps.md").read_text()
 LESSON = (ROOT / "docs" / "lesson.md").read_text()
-PAGES = [ROOT / "README.md", ROOT / "results" / "README.md", *(ROOT / "docs").glob("*.md")]
+PAGES = [ROOT / "README.md", *(ROOT / "results").glob("*.md"), *(ROOT / "docs").glob("*.md")]
 TRAINING = "--total-timesteps 2048 --eval-freq 1024 --eval-episodes 2 --n-steps 256 --no-compile"
 
 
@@ -218,13 +218,15 @@ def test_look_at_noise():
     np.testing.assert_allclose(measured, said, atol=0.011)
 
 
-def test_why_it_works():
-    """With one of the twenty seeds."""
-    code, spectrum = blocks(section(LESSON, "3. Why it works"), "python")
-    lines = printed(code.replace("range(1, 21)", "range(1, 2)")).splitlines()
-    assert [int(re.search(r"goal in (\d+)", line)[1]) for line in lines] == [0, 1, 1, 1]
-    power = [float(line.split()[1]) for line in printed(spectrum).splitlines()]
-    assert power == [1.0, 3.1, 5.3, 1.6]
+def test_the_first_rollout():
+    """With one of the twenty seeds; then without the waves of a swing."""
+    code, power, waves = blocks(section(LESSON, "3. The first rollout"), "python")
+    code = code.replace("range(1, 21)", "range(1, 2)")
+    waves = waves.replace("[:16] = waves[34:]", "[16:34]")
+    filtered = re.sub(r".* noise = .*\n", lambda line: line[0] + waves, code)
+    for each, goals in (code, "0111"), (filtered, "0001"):
+        assert "".join(re.findall(r"goal in (\d)", printed(each))) == goals
+    assert re.findall(r" (.+)", printed(power)) == ["1.0", "3.1", "5.3", "1.6"]
 
 
 def test_short_episodes():
@@ -236,26 +238,15 @@ def test_short_episodes():
         assert round(std, 2) == said and f"{said}" in LESSON
 
 
-def hunks(number):
-    """Pairs of (old lines, new lines) of the lesson's edit of this number."""
-    for hunk in re.split(r"\n\n", blocks(LESSON, "diff")[number - 1].rstrip("\n")):
-        lines = hunk.split("\n")
-        yield tuple("\n".join(line[1:] for line in lines if line[0] == sign) for sign in "-+")
+def edit(*numbers):
+    """Pairs of (old lines, new lines), from the lesson's diffs of these numbers."""
+    for number in numbers:
+        lines = blocks(LESSON, "diff")[number].splitlines()
+        yield tuple("\n".join(x[1:] for x in lines if x[0] in f" {sign}") for sign in "-+")
 
 
-def test_edits_1_to_3(run_edited, capsys):
-    """The learning rate falls; ReLU; the std begins at e."""
-    run_edited(*hunks(1))
-    rates = [float(x) for x in re.findall(r"learning rate (\S+)", capsys.readouterr().out)]
-    assert rates == pytest.approx([1e-2 * (1 - i / 4) for i in range(4)])
-    agent, *_ = run_edited(*hunks(2))
-    assert sum(isinstance(layer, torch.nn.ReLU) for layer in agent.modules()) == 4
-    *_, module = run_edited(*hunks(3))
-    assert module.Agent(3, 1).std().item() == pytest.approx(np.e)
-
-
-def test_edit_4_ornstein_uhlenbeck_noise(run_edited):
-    agent, _, module = run_edited(*hunks(4))
+def test_ornstein_uhlenbeck_noise(run_edited):
+    agent, _, module = run_edited(*edit(0))
     args = module.parse_args(["--n-steps", "20000", "--n-envs", "2", "--total-timesteps", "100000"])
     agent.actor_mean[-1].weight.data.zero_()
     agent.actor_mean[-1].bias.data.zero_()
@@ -268,18 +259,27 @@ def test_edit_4_ornstein_uhlenbeck_noise(run_edited):
         assert (eps[lag:] * eps[:-lag]).mean() == pytest.approx(0.9**lag, abs=0.07)
 
 
-def test_edit_5_restarts_the_noise(run_edited):
+def test_restart_of_the_noise(run_edited):
     """At the end of an episode, and only from the next step on."""
     seen = []
     flags = "--no-compile --max-episode-steps 100 --total-timesteps 512 --eval-freq 512"
-    *_, module = run_edited(*hunks(5), flags=flags)
+    *_, module = run_edited(*edit(2, 3), flags=flags)
 
     def spy(*arguments):
         act = module.exploration(*arguments)
         seen.append((act.eps, act.eps.copy()))
         return act
 
-    run_edited(*hunks(5), flags=flags, exploration=spy)
-    after, before = seen[0]
-    changed = (after != before).all(axis=(1, 2))
+    run_edited(*edit(2, 3), flags=flags, exploration=spy)
+    changed = np.not_equal(*seen[0]).all(axis=(1, 2))
     assert not changed[:100].any() and changed[100:].all()  # Pendulum's episodes end together
+
+
+def test_more_noise_learning_rate_and_relu(run_edited, capsys):
+    *_, module = run_edited(*edit(1))
+    assert module.Agent(3, 1).std().item() == pytest.approx(np.e)
+    run_edited(*edit(4))
+    rates = [float(x) for x in re.findall(r"learning rate (\S+)", capsys.readouterr().out)]
+    assert rates == pytest.approx([1e-2 * (1 - i / 4) for i in range(4)])
+    agent, *_ = run_edited(*edit(5))
+    assert [type(layer) for layer in agent.modules()].count(torch.nn.ReLU) == 4
