@@ -30,6 +30,7 @@ from study.tables import final_return_per_beta, final_returns, markdown
 RESULTS = Path(__file__).parent
 PAGES = [RESULTS.parent / "README.md", RESULTS / "README.md", RESULTS / "notes.md"]
 FILES = ["reproduction.csv", "study.csv", "slices.csv", "methods.csv"]
+SPEEDS = ["speed.csv", "benchmark.csv"]
 FIGURES = [  # names as in plot.py, of these files
     *("claims", "performance_vs_beta", "n_envs_beta_grids", "beside_published", "beta0_vs_vanilla"),
     *("n_envs_vs_n_steps", "n_epochs_vs_beta", "complex_tasks", "transfer", "gsde_vs_beta"),
@@ -85,7 +86,7 @@ def spread(values):
 
 def runs():
     """What was run, a row for the reproduction, the rest of the study, and all other files."""
-    others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:2], "benchmark.csv"}
+    others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:2], *SPEEDS}
     rows = []
     for files in ([FILES[0]], [FILES[1]], sorted(others)):
         made, one = complete(*files), len(files) == 1
@@ -227,13 +228,20 @@ def friction():
 
 def speed():
     """Microseconds per training step of the script and the paper's stack, with evaluations."""
-    table = pd.read_csv(RESULTS / "benchmark.csv")
+    table = pd.read_csv(RESULTS / "speed.csv")
     us = table.pivot_table("total us", "env_id", "contender", sort=False)
     us = us[["this script", "this script, --no-envpool", "the paper's stack"]].dropna()
     faster = (us["the paper's stack"] / us["this script"]).map("{:.1f}".format)
     return markdown(
         us.map("{:.0f}".format).assign(**{"times faster": faster}).reset_index(names="environment")
     )
+
+
+def waiting():
+    """Seconds until the first training step is done, and of what comes before it."""
+    table = pd.read_csv(RESULTS / "speed.csv").dropna(subset="seconds")
+    parts = [f"{row.contender}: {row.seconds:.1f}" for row in table.itertuples()]
+    return f"Seconds that one waits. {'; '.join(parts)}.\n"
 
 
 TABLES = [
@@ -246,10 +254,12 @@ TABLES = [
     final_returns_of_four,
     offset,
     speed,
+    waiting,
     verdicts,
     planned,
+    settings,
+    friction,
 ]
-TABLES += [settings, friction]
 TABLES = {make.__name__: make for make in TABLES}
 
 
