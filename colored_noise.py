@@ -61,11 +61,11 @@ def colored_noise(beta, size, *, generator=None, device=None):
 
 
 class ColoredNoiseProcess:
-    """Hands out colored noise step by step.
+    """Returns colored noise step by step.
 
     Each environment and action dimension has an independent sequence of its own.
-    When all values of the sequences are used, all are drawn anew; ends of episodes do not touch
-    them (Sec. A3).
+    When all values of the sequences are used, new ones are drawn. At the end of an episode they
+    continue (Sec. A3).
 
     Args:
         beta: exponent, a finite number, or one value per action dimension.
@@ -100,7 +100,7 @@ class ColoredNoiseProcess:
     def sample(self, n_steps=None):
         """Returns the next values: (n_envs, action_dim), or (n_steps, n_envs, action_dim).
 
-        The latter where n_steps is given; raises ValueError where it is negative.
+        The second if n_steps is given; raises ValueError if it is negative.
         """
         if n_steps is None:
             return self.sample(1)[0]
@@ -116,7 +116,7 @@ class ColoredNoiseProcess:
         return torch.cat(pieces)
 
     def state_dict(self):
-        """Returns all that `load_state_dict` needs to go on with the very next value.
+        """Returns all that `load_state_dict` needs to continue with the next value.
 
         Not the sequences, which may be large, but the generator's state from before their draw.
         """
@@ -187,9 +187,11 @@ def projected_beta(n_envs, n_steps=2048, seq_len=1000):
     Returns a float within the study's range [-1, 2]: its nearer end, if there is no solution in it.
     Raises ValueError for sizes that are not positive.
 
-    A first guess, not a result. The best betas are averages over 16 environments, whose own range
-    from 0 to 2. Outside of n_envs * n_steps = 2048 to 262,144 it extrapolates. The published betas
-    are for n_envs alone: that n_steps counts alike and how seq_len enters follow from the argument.
+    A first guess, not a result. The best betas are averages over 16 environments; in single ones
+    they range from 0 to 2. Outside of n_envs * n_steps = 2048 to 262,144 it extrapolates. The
+    published betas are for n_steps 2048 and seq_len 1000: what other values do is an assumption.
+    Where n_steps is less than seq_len, a rollout holds only pieces of sequences, whose means this
+    argument does not describe.
     """
     if not min(n_envs, n_steps) > 0:
         raise ValueError(f"need positive n_envs and n_steps, got {n_envs} and {n_steps}")

@@ -1,6 +1,6 @@
 """Makes the figures of results/ and fills in the tables of its texts, from the CSV files there.
 
-    results/make.sh            makes all anew
+    results/make.sh            makes them
     results/make.sh --check    changes nothing; names what differs from the data, and exits with 1
 
 A table stands in a text between <!-- table: NAME --> and <!-- end -->, and is made by the function
@@ -267,7 +267,7 @@ TABLES = {make.__name__: make for make in TABLES}
 
 
 def filled(text):
-    """The text with each of its tables made anew."""
+    """The text with its tables made from the data."""
     return MARKED.sub(lambda match: match[1] + TABLES[match[2]]() + match[3], text)
 
 

@@ -1,8 +1,8 @@
-"""Runs the paper's grids: each run in a process of its own on one core, resumable, none done twice.
+"""Runs the paper's grids: each run in a process of its own on one core, resumable, none repeated.
 
 usage: run_sweep.sh PRESET [what to run] [how to run it] [-- FLAGS FOR EVERY RUN]
 
-presets, each the paper's experiment as it was (dm_control without bootstrap at time limits)  runs
+presets: the paper's experiments (its dm_control runs had no bootstrap at time limits)        runs
   quick     Mountain Car, beta 0 and 0.5, n_envs 4, seeds 1 and 2: minutes                       4
   main      the study: 16 environments x 8 betas x n_envs 1, 2, 4, ..., 128 x 20 seeds       20480
   vanilla   the Vanilla column: white noise from torch's own generator, else as main          2560
@@ -15,7 +15,7 @@ and one that is not the paper's
   gymnasium six MuJoCo tasks, betas 0, 0.5, 1, n_envs 1 and 32, usual settings, 8 seeds        288
 what to run, lists in quotes in place of the preset's
   --envs "A B"        those below (or short: cheetah-run), or any id NAME-v0 or MODULE:NAME
-  --betas "0 0.5"     noise colors, or auto, which goes by n_envs
+  --betas "0 0.5"     noise colors, or auto: chosen by n_envs * n_steps
   --n-envs "4 8"      numbers of environments; likewise --seeds and --n-epochs
   --exp-name NAME     folder of the experiment (ppo_colored_continuous; trpo, a2c, gsde), to which
                       n_steps and n_epochs add _n_steps_1024 and the like
@@ -26,14 +26,14 @@ how to run it
   -j N                N runs at a time on this machine (as many as it has cores)
   --print             print one command per line and nothing else, for GNU parallel or a queue
   --status            say how many are done, running, failed and to do, and the time left
-  --retry-failed      take up failed runs again, from their last checkpoint
+  --retry-failed      continue failed runs from their last checkpoint
   --slurm N           submit a job array of N tasks, which share the runs
   --sbatch="OPTIONS"  for sbatch: "--partition=cpu --time=12:00:00 --mem-per-cpu=2G"; with
                       --cpus-per-task=8 a task does 8 runs at a time
 
 PYTHON names the interpreter (python), as in PYTHON=.venv/bin/python ./run_sweep.sh quick
-Stop it whenever you like (Ctrl-C, kill, scancel): the same command goes on where it was. On a
-second machine that sees the runs folder it shares the work. A run's output is in log.txt in its
+You can stop it at any time (Ctrl-C, kill, scancel): the same command continues. On a second
+machine that sees the runs folder it shares the work. A run's output is in log.txt in its
 folder. A failed run has its exit code and error in the file "failed" there.
 Exit code: 0 all runs complete (or submitted), 1 some are not, 2 wrong usage, 130 or 143 stopped.
 """
@@ -95,7 +95,7 @@ def environments(text):
     found = [(ids_named(word) or [word])[0] for word in words(text)]
     for env_id in found:
         if not re.search(r":|-v[0-9]+$", env_id):
-            raise argparse.ArgumentTypeError(f"'{env_id}' is no environment")
+            raise argparse.ArgumentTypeError(f"'{env_id}' is not the id of an environment")
     return found
 
 
