@@ -142,6 +142,17 @@ def goals():
     return f"Runs that end at its goal, β = 0.5 or 1 against white: {', '.join(parts)}.\n"
 
 
+HALF_OVER_WHITE = {"weights": {0.5: 1, 0: -1}, "by": "beta"}
+
+
+def our_lead(n_envs):
+    """Our runs with these n_envs, the lead of 0.5 over white noise in them, and it as text."""
+    part, cells = colored(n_envs), CELL[: len(n_envs)]
+    found = contrast(part.assign(z=standardize(part)), **HALF_OVER_WHITE, cells=cells)
+    low, high = interval(found)
+    return part, found, f"{found['mean']:z.2f} [{low:z.2f}, {high:z.2f}]"
+
+
 def lead():
     """The lead of beta 0.5 over white noise, ours in performance, the paper's in final return."""
     paper = published("final_return_per_beta")
@@ -149,17 +160,15 @@ def lead():
     paper = paper.rename(columns={"final_return_mean": "performance"})
     rows = []
     for n_envs in ([4], [1, 4, 32]):
-        part = colored(n_envs)
-        weights = {"weights": {0.5: 1, 0: -1}, "by": "beta", "cells": CELL[: len(n_envs)]}
-        ours = contrast(part.assign(z=standardize(part)), **weights)
-        low, high = interval(ours)
+        part, ours, text = our_lead(n_envs)
         row = {"n_envs": ", ".join(map(str, n_envs)), "environments": f"{ours['environments']}"}
-        row["ours [95 % interval]"] = f"{ours['mean']:z.2f} [{low:z.2f}, {high:z.2f}]"
+        row["ours [95 % interval]"] = text
         theirs = paper[paper.n_envs.isin(n_envs)]
         theirs = theirs.assign(z=standardize(theirs))
         same = theirs[theirs.environment.isin(part.environment)]
         for name, cells in (("the same environments", same), ("all 16", theirs)):
-            row[f"paper, {name}"] = f"{contrast(cells, **weights)['mean']:z.2f}"
+            paper_lead = contrast(cells, **HALF_OVER_WHITE, cells=CELL[: len(n_envs)])
+            row[f"paper, {name}"] = f"{paper_lead['mean']:z.2f}"
         rows.append(row)
     return markdown(rows)
 
@@ -168,14 +177,16 @@ def leads():
     """Our leads of `lead`, in a sentence."""
     parts = []
     for n_envs in ([4], [1, 4, 32]):
-        part = colored(n_envs)
-        found = contrast(
-            part.assign(z=standardize(part)), {0.5: 1, 0: -1}, "beta", CELL[: len(n_envs)]
-        )
-        low, high = interval(found)
+        _, found, text = our_lead(n_envs)
         where = f"{found['environments']} environments, n_envs {', '.join(map(str, n_envs))}"
-        parts.append(f"{found['mean']:z.2f} [{low:z.2f}, {high:z.2f}] ({where})")
-    return f"Its lead over white noise, in standard deviations: {' and '.join(parts)}: open.\n"
+        parts.append(f"{text} ({where}: {claims.judge(*interval(found))})")
+    return f"Average lead over white noise, in standard deviations: {', '.join(parts)}.\n"
+
+
+def share():
+    """How much of the study's main grid there is."""
+    count, _, total = coverage().query("says == 'beta 0.5 is best on average'").runs.iloc[0].split()
+    return f"Ours are {count} of the study's {int(total):,} runs, with 3 of its 8 betas.\n"
 
 
 def verdicts():
@@ -249,6 +260,7 @@ TABLES = [
     ahead,
     goals,
     leads,
+    share,
     counts,
     lead,
     final_returns_of_four,

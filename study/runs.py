@@ -148,8 +148,8 @@ def pack(runs, curves, file, overwrite=False):
     A row per run with its arguments and a column per step. Without `overwrite` the file must not
     exist.
     """
-    no_setting = ["source", "environment", "performance", "final_return", "runs_dir"]
-    table = runs.drop(columns=no_setting, errors="ignore").dropna(axis=1, how="all")
+    no_setting = ["source", "environment", "performance", "final_return", "runs_dir", "resume"]
+    table = runs.drop(columns=[*no_setting, "overwrite"], errors="ignore").dropna(axis=1, how="all")
     mode = "w" if overwrite else "x"
     pd.concat([table, curves], axis=1).to_csv(file, mode=mode, index=False, float_format="%.9g")
 
