@@ -521,9 +521,10 @@ def make_all(todo, out):
     """
     made, not_made = {}, []
     out.mkdir(parents=True, exist_ok=True)
-    for path in out.iterdir():
-        if path.stem in todo or path.match("learning_curves_*.p??"):
-            path.unlink()  # of earlier data
+    for suffix in ("png", "pdf", "csv", "md", "tex"):
+        for path in out.glob(f"*.{suffix}"):
+            if path.stem in todo or path.match("learning_curves_*.p??"):
+                path.unlink()  # of earlier data
     for name, (make, data, *rest) in tqdm(todo.items(), desc="tables and figures", unit=""):
         try:
             if isinstance(data, str):

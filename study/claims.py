@@ -26,7 +26,7 @@ from scipy import stats
 
 from study.protocol import BETAS, COMPLEX, N_ENVS, NAMES, SETTINGS
 from study.runs import AXES, CELL, SHARED, Unusable, differences, main_grid, published, value_text
-from study.statistics import contrast, interval, standardize, summed
+from study.statistics import contrast, interval, less_published, standardize
 from study.tables import best_beta_per_env, final_returns, on_published_scale, projected_ranks
 
 # Chance that the 95 % BCa interval of so many seeds misses the mean of 20 others, as the published
@@ -66,29 +66,19 @@ def outside(table):
 def offset(runs):
     """Lines that say how far our final returns are from the published means, and in what tasks.
 
-    On the scale of `on_published_scale`, over cells that weigh the same. The interval is by seeds:
-    their standard deviation is pooled over an environment's cells, and the paper's 20 are taken to
-    scatter as ours do.
+    On the scale of `on_published_scale`, as of `less_published`.
     """
-    runs = on_published_scale(runs[~runs.vanilla])
-    cells = runs.groupby([*CELL, "beta"]).final_return.agg(["mean", "var", "size"])
-    cells["less"] = cells["mean"] - runs.groupby([*CELL, "beta"]).paper.first()
-    cells = cells.assign(df=cells["size"] - 1, weight=1 / cells["size"] + 1 / 20)
-    cells["squares"] = cells["var"].fillna(0) * cells.df
-    tasks = cells.groupby("environment").agg(
-        less=("less", "mean"), n=("less", "size"), df=("df", "sum"), squares=("squares", "sum"),
-        weight=("weight", "sum"),
-    )  # fmt: skip
-    tasks, mean = tasks[tasks.df > 0], cells.less.mean()
-    if tasks.empty:
+    groups = on_published_scale(runs[~runs.vanilla]).groupby([*CELL, "beta"])
+    cells = groups.final_return.agg(["mean", "var", "size"]).assign(paper=groups.paper.first())
+    if cells["size"].max() < 2:
         return ["ours less the published: no cell with two seeds"]
-    by_task = tasks.squares / tasks.df * tasks.weight / len(cells) ** 2
-    low, high = interval({"mean": mean} | summed(by_task, tasks.df))
-    line = f"ours less the published {mean:z.2f} [{low:z.2f}, {high:z.2f}] on average over "
-    line += f"{len(cells)} cells, where the paper's lowest is 0 and its highest 1"
-    each = [
-        f"{x.Index} {x.less:z.2f} ({x.n} cells)" for x in tasks.sort_values("less").itertuples()
-    ]
+    found = less_published(cells)
+    low, high = interval(found)
+    line = f"ours less the published {found['mean']:z.2f} [{low:z.2f}, {high:z.2f}] on average "
+    line += f"over {len(cells)} cells, where the paper's lowest is 0 and its highest 1"
+    tasks = (cells["mean"] - cells.paper).groupby("environment").agg(["mean", "size"])
+    tasks = tasks.sort_values("mean")
+    each = [f"{name} {less:z.2f} ({n} cells)" for name, less, n in tasks.itertuples()]
     return [line, ", ".join(each)]
 
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from study.protocol import GYMNASIUM
 from study.runs import load, published
-from study.statistics import mean_interval
+from study.statistics import interval, less_published, mean_interval
 from study.tables import markdown
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -100,15 +100,13 @@ def pendulum_beside_published():
         less = f"{values.mean() - paper[beta]:.0f}"
         rows.append(row | {"published": f"{paper[beta]}", "ours less the published": less})
     for name, part in (("average", runs), ("seeds above 100 alone", runs[runs.seed > 100])):
-        cells = part.groupby("beta").final_return.agg(["mean", "var", "size"])
-        df = cells["size"] - 1
-        pooled = (cells["var"] * df).sum() / df.sum()
-        se = (pooled * (1 / cells["size"] + 1 / 20)).sum() ** 0.5 / len(cells)
-        mean, half = (cells["mean"] - paper[cells.index]).mean(), stats.t.ppf(0.975, df.sum()) * se
-        p = 2 * stats.t.sf(abs(mean) / se, df.sum())
-        average = f"{mean:.0f} [{mean - half:.0f}, {mean + half:.0f}], p = {p:.3f}"
-        row = {"beta": name, "runs": f"{len(part)}", "ours less the published": average}
-        rows.append(row)
+        cells = part.groupby(["environment", "beta"]).final_return.agg(["mean", "var", "size"])
+        cells["paper"] = paper[cells.index.get_level_values("beta")].to_numpy()
+        found = less_published(cells)
+        low, high = interval(found)
+        p = 2 * stats.t.sf(abs(found["mean"]) / found["se"], found["df"])
+        average = f"{found['mean']:.0f} [{low:.0f}, {high:.0f}], p = {p:.3f}"
+        rows.append({"beta": name, "runs": f"{len(part)}", "ours less the published": average})
     return pd.DataFrame(rows).fillna("")
 
 
@@ -117,9 +115,7 @@ def mountain_car():
     runs = as_in_the_paper(complete(CAR, "study")).query("n_envs == 4 and seed > 400")
     released = complete(CAR, "released_code")
     cells = {
-        "beta 0.2, batch size 128, T = 1000": (runs[runs.beta == "0.2"], 5)
-        if len(runs)
-        else ([], 5),
+        "beta 0.2, batch size 128, T = 1000": (runs[runs.beta == "0.2"], 5),
         "beta 0.2, batch size 64, T = 1024": (released, 5),
         "beta 0, batch size 128, T = 1000": (runs[runs.beta == "0"], 0),
     }
