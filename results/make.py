@@ -28,9 +28,9 @@ from study.statistics import contrast, interval, mean_interval, standardize
 from study.tables import final_return_per_beta, final_returns, markdown
 
 RESULTS = Path(__file__).parent
-PAGES = [RESULTS.parent / "README.md", RESULTS / "README.md", RESULTS / "notes.md"]
+ROOT = RESULTS.parent
+PAGES = [ROOT / "README.md", ROOT / "docs/sweeps.md", RESULTS / "README.md", RESULTS / "notes.md"]
 FILES = ["reproduction.csv", "study.csv", "slices.csv", "methods.csv"]
-SPEEDS = ["speed.csv", "benchmark.csv"]
 FIGURES = [  # names as in plot.py, of these files
     *("claims", "performance_vs_beta", "n_envs_beta_grids", "beside_published", "beta0_vs_vanilla"),
     *("n_envs_vs_n_steps", "n_epochs_vs_beta", "complex_tasks", "transfer", "gsde_vs_beta"),
@@ -86,7 +86,7 @@ def spread(values):
 
 def runs():
     """What was run, a row for the reproduction, the rest of the study, and all other files."""
-    others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:2], *SPEEDS}
+    others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:2], "speed.csv"}
     rows = []
     for files in ([FILES[0]], [FILES[1]], sorted(others)):
         made, one = complete(*files), len(files) == 1
@@ -255,6 +255,14 @@ def waiting():
     return f"Seconds that one waits. {'; '.join(parts)}.\n"
 
 
+def costs():
+    """Median minutes of a run in each environment, and core-hours of the whole study."""
+    minutes = complete("study.csv").groupby("environment").wall_seconds.median() / 60
+    each = ", ".join(f"{name} {time:.0f}" for name, time in minutes.sort_values().items())
+    hours = f"All 20,480: about {20480 * minutes.mean() / 60:,.0f} core-hours."
+    return f"Minutes of a run, median in `study.csv`: {each}. {hours}\n"
+
+
 TABLES = [
     runs,
     ahead,
@@ -267,6 +275,7 @@ TABLES = [
     offset,
     speed,
     waiting,
+    costs,
     verdicts,
     planned,
     settings,
@@ -325,9 +334,9 @@ def main():
                 path.write_text(text)
             for path in pictures:
                 shutil.copy(path, RESULTS)
-    changed = [path.name for path in [*pages, *pictures]]
-    for name in changed:
-        print(f"{'differs' if args.check else 'made'}: results/{name}")
+    changed = [*pages, *(RESULTS / path.name for path in pictures)]
+    for path in changed:
+        print(f"{'differs' if args.check else 'made'}: {path.relative_to(ROOT)}")
     print(f"{len(drawn)} figures and the tables of {len(PAGES)} texts, {len(changed)} differed")
     sys.exit(bool(args.check and changed))
 

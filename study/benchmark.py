@@ -10,8 +10,8 @@ as in the protocol (one per 10,240 steps). The first round is not counted: torch
 Policies are as they are after a few updates. "files" is logging, evaluations.csv and a checkpoint
 (here in each round, in a run every 5 seconds).
 
-More tables: the training alone by number of environments; a run by number of threads, no longer
-held on one core; and the seconds that one waits before the first training step.
+More tables: a run by number of threads, no longer held on one core; and the seconds that one waits
+before the first training step.
 """
 
 import argparse
@@ -124,7 +124,7 @@ def contend(run, pipe, flags):
     run(Clock(pipe), flags)
 
 
-def measure(env_id, n_envs, n_rounds, contenders):
+def measure(env_id, n_rounds, contenders):
     """Lets contenders, {name: (run, flags)}, play rounds in turns: one, then n_rounds that count.
 
     Returns a row for each: medians over rounds, and the smallest and largest total.
@@ -133,7 +133,7 @@ def measure(env_id, n_envs, n_rounds, contenders):
     pipes, processes = {}, []
     for name, (run, flags) in contenders.items():
         pipes[name], pipe = context.Pipe()
-        arguments = run, pipe, f"--env-id {env_id} --n-envs {n_envs} {flags}"
+        arguments = run, pipe, f"--env-id {env_id} --n-envs 4 {flags}"
         processes.append(context.Process(target=contend, args=arguments, daemon=True))
         processes[-1].start()
         pipe.close()  # so that recv raises EOFError where the process has died
@@ -148,7 +148,7 @@ def measure(env_id, n_envs, n_rounds, contenders):
     rows = []
     for name, reports in rounds.items():
         table = pd.DataFrame(reports[1:])
-        row = {"env_id": env_id, "contender": name, "n_envs": n_envs, **table.median()}
+        row = {"env_id": env_id, "contender": name, **table.median()}
         rows.append(row | {"from": table["total us"].min(), "to": table["total us"].max()})
     return rows
 
@@ -164,20 +164,8 @@ def phases(args):
         "the paper's stack": (run_sb3, EACH_ROUND),
     }
     for env_id in args.env_ids or DM_CONTROL:
-        rows = measure(env_id, 4, args.rounds, contenders)
+        rows = measure(env_id, args.rounds, contenders)
         yield [row | {"x faster": rows[-1]["total us"] / row["total us"]} for row in rows]
-
-
-def n_envs(args):
-    """The script's training, without evaluations, with each number of environments."""
-    flags = f"--threads 1 --eval-freq {TOTAL_STEPS} --eval-episodes 1"
-    contenders = {
-        "training": (run_script, flags),
-        "training, --no-envpool": (run_script, f"{flags} --no-envpool"),
-    }
-    for env_id in args.env_ids or DM_CONTROL[:1]:
-        tables = [measure(env_id, n, args.rounds, contenders) for n in (1, 4, 16, 64, 128)]
-        yield sum(tables, [])
 
 
 def threads(args):
@@ -187,7 +175,7 @@ def threads(args):
         for n in sorted({1, len(CORES)}):
             hold_on_cores(n)
             contender = {f"one run, --threads {n}": (run_script, f"{EACH_ROUND} --threads {n}")}
-            rows += measure(env_id, 4, args.rounds, contender)
+            rows += measure(env_id, args.rounds, contender)
         yield [row | {"minutes": row["total us"] * TOTAL_STEPS / 60e6} for row in rows]
 
 
@@ -237,7 +225,7 @@ def hold_on_cores(n):
         os.sched_setaffinity(0, CORES[-n:])
 
 
-TABLES = {table.__name__: table for table in (phases, n_envs, threads, waiting)}
+TABLES = {table.__name__: table for table in (phases, threads, waiting)}
 
 
 def parse_args(argv=None):

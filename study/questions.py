@@ -195,7 +195,16 @@ def gymnasium(last=5):
     return table
 
 
+def gymnasium_baseline():
+    """Gymnasium, white noise: our mean of the last five evaluations in A, beside published PPO."""
+    scores, paper = gymnasium_scores(), published("gymnasium").fillna("").set_index("task")
+    tasks = dict.fromkeys(task for task, _, _ in scores)
+    ours = [{"task": task, "this script (v5)": mean_text(scores[task, 1, "0"])} for task in tasks]
+    return pd.DataFrame(ours).join(paper, on="task") if ours else None
+
+
 QUESTIONS = [stable_baselines3, pendulum_order, pendulum_beside_published, mountain_car, gymnasium]
+QUESTIONS += [gymnasium_baseline]
 
 
 def answers():

@@ -119,22 +119,20 @@ def test_measure(monkeypatch):
     """In processes of their own; medians over all rounds but the first."""
     fork = multiprocessing.get_context("fork")  # a new Python would import all of the above
     monkeypatch.setattr(multiprocessing, "get_context", lambda name: fork)
-    rows = benchmark.measure(CAR, 4, 3, {name: (contender, "") for name in ("one", "other")})
+    rows = benchmark.measure(CAR, 3, {name: (contender, "") for name in ("one", "other")})
     for row, name in zip(rows, ("one", "other"), strict=True):
-        assert (row["env_id"], row["contender"], row["n_envs"]) == (CAR, name, 4)
+        assert (row["env_id"], row["contender"]) == (CAR, name)
         columns = [row[name] for name in ("update", "total us", "from", "to")]
         assert columns == pytest.approx([2e6, 2e6, 1e6, 4e6], rel=1e-3)
 
 
 def test_tables(tmp_path, monkeypatch, capsys):
-    """All four, of made-up times, in one file and on the terminal."""
+    """All three, of made-up times, in one file and on the terminal."""
     commands = []
 
-    def measure(env_id, n_envs, n_rounds, contenders):
-        about = {"env_id": env_id, "n_envs": n_envs}
-        return [
-            {**about, "contender": c, "total us": 10.0 * i} for i, c in enumerate(contenders, 1)
-        ]
+    def measure(env_id, n_rounds, contenders):
+        totals = enumerate(contenders, 1)
+        return [{"env_id": env_id, "contender": c, "total us": 10.0 * i} for i, c in totals]
 
     def seconds(command, variables):
         commands.append(command)
@@ -146,7 +144,7 @@ def test_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "CORES", [0, 1])
     benchmark.main(benchmark.parse_args(["--rounds", "1", "--csv", str(tmp_path / "table.csv")]))
     table = pd.read_csv(tmp_path / "table.csv")
-    assert len(table) == 3 * 3 + 5 * 2 + 3 * 2 + 7
+    assert len(table) == 3 * 3 + 3 * 2 + 7
     assert (table[table.contender == "the paper's stack"]["x faster"] == 1).all()
     assert (table[table.contender == "this script"]["x faster"] == 3).all()
     one_run = table[table.contender == "one run, --threads 2"]

@@ -1,5 +1,7 @@
 """study/questions.py on made-up runs, beside numbers that were put in."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,7 +18,7 @@ def test_leads_in_gymnasium_are_those_put_in(monkeypatch):
             for beta, lead in (("0", 0), ("0.5", 1), ("1", -0.5 * (n_envs == 32))):
                 x = rng.normal(size=8)
                 scores[task, n_envs, beta] = 10**scale * ((x - x.mean()) / x.std(ddof=1) + lead)
-    monkeypatch.setattr(questions, "gymnasium_scores", lambda last: scores)
+    monkeypatch.setattr(questions, "gymnasium_scores", lambda last=5: scores)
     table = questions.gymnasium().set_index("task")
     assert (table["A: 0.5 over 0"][GYMNASIUM].astype(float) == 1).all()
     assert table.loc["average"].astype(float).tolist() == [1, 0, 1, -0.5, -0.5]
@@ -24,6 +26,10 @@ def test_leads_in_gymnasium_are_those_put_in(monkeypatch):
     ends = table["A: 0.5 over 0"]["for these tasks, 95 %"].split(" to ")
     assert [float(end) for end in ends] == pytest.approx([1 - half, 1 + half], abs=0.005)
     assert table["A: 0.5 over 0"]["for tasks like these, 95 %"] == "1.00 to 1.00"
+    baseline = questions.gymnasium_baseline().set_index("task")
+    assert baseline["SB3 zoo (v3)"]["Hopper-v5"] == "one tuned run 2410"
+    mean, low, high = map(float, re.findall(r"[-\d.]+", baseline["this script (v5)"]["Hopper-v5"]))
+    assert mean == 0 and -80 < low < -50 and 50 < high < 80  # of 8 with standard deviation 100
 
 
 def test_the_interval_of_these_tasks_holds_what_it_should(monkeypatch):
