@@ -20,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from PIL import Image
+from scipy import stats
 
 import plot
 from study import claims, questions
@@ -153,12 +154,15 @@ def our_lead(n_envs):
     return part, found, f"{found['mean']:z.2f} [{low:z.2f}, {high:z.2f}]"
 
 
+def published_cells():
+    """The paper's mean final returns, named as if they were performances of runs."""
+    paper = published("final_return_per_beta").query("beta != 'vanilla'").astype({"beta": float})
+    return paper.rename(columns={"final_return_mean": "performance"}).assign(method="ppo")
+
+
 def lead():
     """The lead of beta 0.5 over white noise, ours in performance, the paper's in final return."""
-    paper = published("final_return_per_beta")
-    paper = paper[paper.beta.isin(["0", "0.5", "1"])].astype({"beta": float}).assign(method="ppo")
-    paper = paper.rename(columns={"final_return_mean": "performance"})
-    rows = []
+    paper, rows = published_cells().query("beta in [0, 0.5, 1]"), []
     for n_envs in ([4], [1, 4, 32]):
         part, ours, text = our_lead(n_envs)
         row = {"n_envs": ", ".join(map(str, n_envs)), "environments": f"{ours['environments']}"}
@@ -181,6 +185,26 @@ def leads():
         where = f"{found['environments']} environments, n_envs {', '.join(map(str, n_envs))}"
         parts.append(f"{text} ({where}: {claims.judge(*interval(found))})")
     return f"Average lead over white noise, in standard deviations: {', '.join(parts)}.\n"
+
+
+def undecided():
+    """How many runs it takes to find leads as small as the published ones."""
+    paper, ours = published_cells(), main_runs().groupby(["environment", "beta", "n_envs"])
+    cells = ours.final_return.agg(["var", "size"]).dropna()
+    squares = (cells["var"] * (cells["size"] - 1)).groupby("environment").sum()
+    variances = squares / (cells["size"] - 1).groupby("environment").sum()
+    scatter = (variances / paper.groupby("environment").performance.var(ddof=0)).mean()
+    z, rows = paper.assign(z=standardize(paper)), []
+    pairs = (0.5, 0.2, "beta"), (4, 2, "n_envs"), (4, 8, "n_envs")
+    for best, other, column in (*pairs, ((0.5, 4), (0.5, 8), ["beta", "n_envs"])):
+        means = z.groupby(column).z.mean()
+        row = {"": "beta, n_envs" if isinstance(column, list) else column}
+        row |= {"best, as the paper says": f"{best}", "rival": f"{other}"}
+        lead = means[best] - means[other]
+        # Of a difference of two means of n / 2 runs; found with a power of 80 %
+        n = 4 * scatter * ((stats.norm.ppf(0.975) + stats.norm.ppf(0.8)) / lead) ** 2
+        rows.append(row | {"lead": f"{lead:z.2f}", "runs of these two": claims.rounded(n)})
+    return markdown(rows)
 
 
 def share():
@@ -278,6 +302,7 @@ TABLES = [
     costs,
     verdicts,
     planned,
+    undecided,
     settings,
     friction,
 ]
