@@ -37,6 +37,8 @@ FIGURES = [  # names as in plot.py, of these files
     *("n_envs_vs_n_steps", "n_epochs_vs_beta", "complex_tasks", "transfer", "gsde_vs_beta"),
     *(f"learning_curves_n_envs_{n_envs}" for n_envs in (1, 4, 32)),
 ]
+GYMNASIUM = RESULTS / "gymnasium.csv"
+FIGURES += ["gymnasium"] * GYMNASIUM.exists()
 TOLERANCE = 32
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 BETAS = [0, 0.5, 1]
@@ -249,6 +251,25 @@ def planned():
     return questions.answers()
 
 
+def gymnasium():
+    """What the runs of Gymnasium's tasks say, in the words of plans.md."""
+    table = questions.gymnasium()
+    if table is None:
+        return "In Gymnasium's MuJoCo tasks [288 runs are planned](results/plans.md).\n"
+    table = table.set_index("task")
+    lines = [f"In {len(table) - 4} of Gymnasium's MuJoCo tasks, with the settings usual there:", ""]
+    for column, what in (
+        ("A: 0.5 over 0", "n_envs 1, n_steps 2048: lead of β = 0.5 over white noise"),
+        ("B: 0.5 over 0", "n_envs 32, n_steps 128: lead of β = 0.5 over white noise"),
+        ("1 over 0: B less A", "what β = 1 gains on white noise from the first to the second"),
+    ):
+        mean, ends = table[column][["average", "for these tasks, 95 %"]]
+        low, high = map(float, ends.split(" to "))
+        verdict = "it helps" if low > 0 else "it hurts" if high < 0 else "no difference found"
+        lines.append(f"- {what}: {mean} [{low:.2f}, {high:.2f}], {verdict}")
+    return "\n".join(lines) + "\n"
+
+
 def friction():
     """How many runs of the point with white noise, n_envs 4, end at the goal (it gives 1)."""
     rows = []
@@ -305,6 +326,7 @@ TABLES = [
     undecided,
     settings,
     friction,
+    gymnasium,
 ]
 TABLES = {make.__name__: make for make in TABLES}
 
@@ -320,6 +342,11 @@ def filled(text):
 def draw(folder):
     """Draws all figures to a folder; returns their paths."""
     todo = plot.results(*study_runs(), BETAS)
+    if "gymnasium" in FIGURES:
+        runs, curves = load([GYMNASIUM])
+        runs = runs[runs.status == "complete"].astype({"beta": float})
+        runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
+        todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
     tables = {todo[name][1] for name in FIGURES if isinstance(todo[name][1], str)}
     todo = {name: todo[name] for name in [*tables, *FIGURES]}
     todo["noise_random_walks"] = (plot.random_walks, BETAS)
