@@ -52,7 +52,7 @@ def difference_text(a, b):
     """Mean of a less that of b with Welch's interval, and p of Mann and Whitney's test."""
     low, high = stats.ttest_ind(a, b, equal_var=False).confidence_interval()
     p = stats.mannwhitneyu(a, b).pvalue
-    return f"{np.mean(a) - np.mean(b):.0f} [{low:.0f}, {high:.0f}], p = {p:.2f}"
+    return f"{np.mean(a) - np.mean(b):.0f} [{low:.0f}, {high:.0f}], p = {p:.2g}"
 
 
 def stable_baselines3():
@@ -105,7 +105,7 @@ def pendulum_beside_published():
         found = less_published(cells)
         low, high = interval(found)
         p = 2 * stats.t.sf(abs(found["mean"]) / found["se"], found["df"])
-        average = f"{found['mean']:.0f} [{low:.0f}, {high:.0f}], p = {p:.3f}"
+        average = f"{found['mean']:.0f} [{low:.0f}, {high:.0f}], p = {p:.2g}"
         rows.append({"beta": name, "runs": f"{len(part)}", "ours less the published": average})
     return pd.DataFrame(rows).fillna("")
 
@@ -128,10 +128,10 @@ def mountain_car():
             row = {"": name, "end at the goal": f"{count} of {n}"}
             row["share, 95 % interval"] = f"{low:.2f} to {high:.2f}"
             p = stats.fisher_exact([counts[-1], [paper, 20 - paper]]).pvalue
-            rows.append(row | {"published": f"{paper} of 20", "p": f"{p:.2f}"})
+            rows.append(row | {"published": f"{paper} of 20", "p": f"{p:.2g}"})
     if len(released) and len(counts) > 1:
         p = stats.fisher_exact(counts[:2]).pvalue
-        rows.append({"": "the first two against each other", "p": f"{p:.2f}"})
+        rows.append({"": "the first two against each other", "p": f"{p:.2g}"})
     return pd.DataFrame(rows).fillna("") if rows else None
 
 
