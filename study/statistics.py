@@ -138,19 +138,30 @@ def summed(variances, df):
     return {"se": total**0.5, "df": total**2 / squares if squares != 0 else np.inf}
 
 
+def pooled_variances(cells):
+    """Variance of the seeds in each environment, pooled over its cells, and degrees of freedom.
+
+    cells: DataFrame, its first index level `environment`, columns var and size. Returns two Series;
+    environments with one seed in each cell are left out.
+    """
+    df = cells["size"] - 1
+    squares = (cells["var"].fillna(0) * df).groupby("environment").sum()
+    df = df.groupby("environment").sum()
+    return (squares / df)[df > 0], df[df > 0]
+
+
 def less_published(cells):
     """Mean of our means less the published ones, over cells that weigh the same, and its error.
 
-    By seeds: their standard deviation is pooled over an environment's cells, and the paper's 20
-    are taken to scatter as ours do. cells: DataFrame, its first index level `environment`, columns
-    mean, var and size (of our runs) and paper. Returns a dict of mean, se and df, for `interval`.
+    By seeds: their variance is that of `pooled_variances`, and the paper's 20 are taken to scatter
+    as ours do. cells: as there, with columns mean (of our runs) and paper, too. Returns a dict of
+    mean, se and df, for `interval`.
     """
-    df = cells["size"] - 1
-    table = pd.DataFrame({"df": df, "squares": cells["var"].fillna(0) * df})
-    table = table.assign(weight=1 / cells["size"] + 1 / 20).groupby("environment").sum()
-    table = table[table.df > 0]
-    by_environment = table.squares / table.df * table.weight / len(cells) ** 2
-    return {"mean": (cells["mean"] - cells.paper).mean()} | summed(by_environment, table.df)
+    variances, df = pooled_variances(cells)
+    weight = (1 / cells["size"] + 1 / 20).groupby("environment").sum()[df.index]
+    return {"mean": (cells["mean"] - cells.paper).mean()} | summed(
+        variances * weight / len(cells) ** 2, df
+    )
 
 
 def same_cells(index, of):

@@ -4,11 +4,13 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
 from results import make
 from study import sweep
+from study.protocol import GYMNASIUM
 
 RESULTS = Path(make.__file__).parent
 
@@ -32,6 +34,20 @@ def test_every_figure_is_shown_and_made():
     """Those that no data make are rendered, or moving."""
     shown = {path.stem for path in RESULTS.iterdir() if path.suffix in (".png", ".gif")}
     assert shown == {*make.FIGURES, "noise_random_walks", "environments", "animation"}
+
+
+@pytest.mark.parametrize(
+    ("ends", "verdict"),
+    [("0.01 to 0.60", "helps"), ("-0.60 to -0.01", "hurts"), ("-0.60 to 0.01", "no difference")],
+)
+def test_gymnasium_is_judged_by_all_six_tasks(monkeypatch, ends, verdict):
+    columns = ["A: 0.5 over 0", "B: 0.5 over 0", "1 over 0: B less A"]
+    rows = ["average", "for these tasks, 95 %", "the same, 98.3 %", "for tasks like these, 95 %"]
+    table = pd.DataFrame({"task": [*GYMNASIUM, *rows]} | dict.fromkeys(columns, ends))
+    monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
+    assert make.gymnasium().count(verdict) == 3
+    monkeypatch.setattr(make.questions, "gymnasium", lambda: table[1:])
+    assert verdict not in make.gymnasium()
 
 
 @pytest.mark.parametrize(("change", "same"), [(2, True), (200, False)])
