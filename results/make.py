@@ -37,7 +37,7 @@ from study.tables import final_return_per_beta, final_returns, markdown
 RESULTS = Path(__file__).parent
 ROOT = RESULTS.parent
 PAGES = [ROOT / "README.md", ROOT / "docs/sweeps.md", RESULTS / "README.md", RESULTS / "notes.md"]
-FILES = ["reproduction.csv", "study.csv", "slices.csv", "methods.csv"]
+FILES = ["reproduction.csv", "study.csv", "study_n_envs.csv", "slices.csv", "methods.csv"]
 FIGURES = [  # names as in plot.py, of these files
     *("claims", "performance_vs_beta", "n_envs_beta_grids", "beside_published", "beta0_vs_vanilla"),
     *("n_envs_vs_n_steps", "n_epochs_vs_beta", "complex_tasks", "transfer", "gsde_vs_beta"),
@@ -71,10 +71,12 @@ def main_runs():
 
 
 def colored(n_envs):
-    """Main runs with these n_envs and BETAS, of environments that have all these n_envs."""
+    """Main runs with these n_envs and BETAS, of environments that have all these cells."""
     runs = main_runs()
     runs = runs[runs.n_envs.isin(n_envs) & runs.beta.isin(BETAS)]
-    return runs[runs.groupby("environment").n_envs.transform("nunique") == len(n_envs)]
+    runs = runs.assign(cell=runs.n_envs.astype(str) + " " + runs.beta.astype(str))
+    n_cells = runs.groupby("environment").cell.transform("nunique")
+    return runs[n_cells == len(n_envs) * len(BETAS)].drop(columns="cell")
 
 
 @functools.cache
@@ -94,10 +96,10 @@ def spread(values):
 
 
 def runs():
-    """What was run, a row for the reproduction, the rest of the study, and all other files."""
-    others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:2], "speed.csv"}
+    """What was run, a row for each of the first three FILES, and one for all other files."""
+    others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:3], "speed.csv"}
     rows = []
-    for files in ([FILES[0]], [FILES[1]], sorted(others)):
+    for files in (*([file] for file in FILES[:3]), sorted(others)):
         made, one = complete(*files), len(files) == 1
         seeds = made.groupby(["env_id", "beta", "n_envs"]).seed.nunique()
         row = {"file": f"`{files[0]}`" if one else "others: [notes](notes.md)"}
@@ -306,10 +308,11 @@ def waiting():
 
 def costs():
     """Median minutes of a run in each environment, and core-hours of the whole study."""
-    minutes = complete("study.csv").groupby("environment").wall_seconds.median() / 60
+    made = complete("study.csv", "study_n_envs.csv")
+    minutes = made.groupby("environment").wall_seconds.median() / 60
     each = ", ".join(f"{name} {time:.0f}" for name, time in minutes.sort_values().items())
     hours = claims.rounded(20480 * minutes.mean() / 60)
-    return f"Minutes of a run, median in `study.csv`: {each}. All 20,480: {hours} core-hours.\n"
+    return f"Median minutes of a run: {each}. All 20,480: {hours} core-hours.\n"
 
 
 TABLES = [
