@@ -17,7 +17,9 @@ python -m study.runs pack reproduction/ results/reproduction.csv --overwrite
 python -m study.runs pack study_runs/ results/study.csv --overwrite
 
 # study_n_envs.csv: the same in the seven environments that lacked n_envs 1 and 32
-./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 2" --envs "SwimmerUMaze Swimmer4Rooms walker-run ball_in_cup-catch door-v0 AntUMaze Ant4Rooms" -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 2" --envs "SwimmerUMaze walker-run ball_in_cup-catch door-v0 AntUMaze" -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 3" --envs Swimmer4Rooms -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "3 4" --envs Ant4Rooms -- --eval-episodes 10 --eval-once-per-policy
 python -m study.runs pack study_n_envs/ results/study_n_envs.csv --overwrite
 
 # slices.csv: Sec. A6, A8, A11 and A12
