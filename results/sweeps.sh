@@ -8,7 +8,8 @@
 python -m study.runs pack reproduction/ results/reproduction.csv --overwrite
 
 # study.csv: more environments and n_envs, 10 episodes instead of 50 in an evaluation
-./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs 4 --seeds "1 2 3 4 5" --envs "hopper-hop walker-run door-v0 PointUMaze Point4Rooms SwimmerUMaze Swimmer4Rooms AntUMaze Ant4Rooms" -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs 4 --seeds "1 2 3 4 5" --envs "hopper-hop walker-run door-v0 PointUMaze Point4Rooms SwimmerUMaze AntUMaze Ant4Rooms" -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs 4 --seeds "4 5" --envs Swimmer4Rooms -- --eval-episodes 10 --eval-once-per-policy
 ./run_sweep.sh main --runs-dir study_runs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 2 3" --envs "pendulum-swingup MountainCarContinuous cartpole-balance_sparse reacher-hard cartpole-swingup_sparse cheetah-run PointUMaze Point4Rooms hopper-hop" -- --eval-episodes 10 --eval-once-per-policy
 ./run_sweep.sh main --runs-dir study_runs --betas "0.5 1" --n-envs 1 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-episodes 10 --eval-once-per-policy
 ./run_sweep.sh main --runs-dir study_runs --betas "0.2 0.5 0.75" --n-envs 4 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-episodes 10 --eval-once-per-policy
@@ -18,9 +19,13 @@ python -m study.runs pack study_runs/ results/study.csv --overwrite
 
 # study_n_envs.csv: the same in the seven environments that lacked n_envs 1 and 32
 ./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 2" --envs "SwimmerUMaze walker-run ball_in_cup-catch door-v0 AntUMaze" -- --eval-episodes 10 --eval-once-per-policy
-./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "1 3" --envs Swimmer4Rooms -- --eval-episodes 10 --eval-once-per-policy
-./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "3 4" --envs Ant4Rooms -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir study_n_envs --betas "0 0.5 1" --n-envs "1 32" --seeds "3 4" --envs "Swimmer4Rooms Ant4Rooms" -- --eval-episodes 10 --eval-once-per-policy
 python -m study.runs pack study_n_envs/ results/study_n_envs.csv --overwrite
+
+# same_swimmer.csv: in no average, since they are runs of SwimmerUMaze in all but the name
+./run_sweep.sh main --runs-dir same_swimmer --betas "0 0.5 1" --n-envs 4 --seeds "1 2 3" --envs Swimmer4Rooms -- --eval-episodes 10 --eval-once-per-policy
+./run_sweep.sh main --runs-dir same_swimmer --betas "0 0.5 1" --n-envs "1 32" --seeds 1 --envs Swimmer4Rooms -- --eval-episodes 10 --eval-once-per-policy
+python -m study.runs pack same_swimmer/ results/same_swimmer.csv --overwrite
 
 # slices.csv: Sec. A6, A8, A11 and A12
 ./run_sweep.sh vanilla --runs-dir slices --n-envs 4 --seeds "1 2 3" --envs "MountainCarContinuous pendulum-swingup cartpole-balance_sparse reacher-hard" -- --eval-episodes 10 --eval-once-per-policy
