@@ -71,12 +71,12 @@ def main_runs():
 
 
 def colored(n_envs):
-    """Main runs with these n_envs and BETAS, of environments that have all these cells."""
+    """Main runs with these n_envs and BETAS, of environments with two seeds in all these cells."""
     runs = main_runs()
     runs = runs[runs.n_envs.isin(n_envs) & runs.beta.isin(BETAS)]
-    runs = runs.assign(cell=runs.n_envs.astype(str) + " " + runs.beta.astype(str))
-    n_cells = runs.groupby("environment").cell.transform("nunique")
-    return runs[n_cells == len(n_envs) * len(BETAS)].drop(columns="cell")
+    seeds = runs.groupby(["environment", "n_envs", "beta"]).size()
+    n_cells = (seeds > 1).groupby("environment").sum()
+    return runs[runs.environment.map(n_cells) == len(n_envs) * len(BETAS)]
 
 
 @functools.cache
