@@ -398,8 +398,8 @@ def loss_gradients(loss_function, agent, minibatch, args):
     """Returns the gradients of the loss, scaled down to --max-grad-norm, and metrics to log.
 
     This is loss.backward() and clip_grad_norm_(), in a form of which torch.compile makes one graph,
-    with the loss: a third of the time of --no-compile. A Python number that changes, such as one in
-    args, takes effect, but the graph is then compiled again: 10 seconds.
+    with the loss: a third of the time of --no-compile. A number in args may change during training.
+    Make it a tensor: with a Python number each new value compiles the graph again, 10 seconds.
     """
     loss, metrics = loss_function(agent, minibatch, args)
     # materialize_grads: zeros for parameters that the loss does not use
