@@ -34,7 +34,6 @@ import filelock
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium import spaces
 from torch import nn
 from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
@@ -202,44 +201,6 @@ def numpy_policy(actor):
 
 
 # --- The environments
-class FlatEnv(gym.Wrapper):
-    """Observations are one float32 vector, actions one vector. Without infos, which take time."""
-
-    def __init__(self, env, rescale_actions):
-        super().__init__(env)
-        obs_dim, actions = spaces.flatdim(env.observation_space), env.action_space
-        self.observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,))
-        self._low, self._high = actions.low.reshape(-1), actions.high.reshape(-1)
-        self._rescale = rescale_actions
-        low, high = (-1, 1) if rescale_actions else (self._low, self._high)
-        self.action_space = spaces.Box(low, high, self._low.shape, actions.dtype)
-
-    def reset(self, *, seed=None, options=None):
-        if seed is not None:  # some environments draw from their spaces
-            self.env.action_space.seed(seed)
-            self.env.observation_space.seed(seed)
-        obs, _ = self.env.reset(seed=seed, options=options)
-        return flat(self.env.observation_space, obs), {}
-
-    def step(self, action):
-        if self._rescale:
-            action = self._low + (action + 1) / 2 * (self._high - self._low)
-            action = np.clip(action, self._low, self._high)  # rounding may leave them
-        action = action.astype(self._low.dtype).reshape(self.env.action_space.shape)
-        obs, reward, terminated, truncated, _ = self.env.step(action)
-        return flat(self.env.observation_space, obs), reward, terminated, truncated, {}
-
-
-def flat(space, obs):
-    """The observation as a float32 vector; spaces.flatten would first cast to the space's type."""
-    if isinstance(space, spaces.Box):
-        return np.asarray(obs, np.float32).flatten()
-    if not isinstance(space, spaces.Dict | spaces.Tuple):
-        return spaces.flatten(space, obs).astype(np.float32)
-    keys = space if isinstance(space, spaces.Dict) else range(len(space))
-    return np.concatenate([flat(space[key], obs[key]) for key in keys])
-
-
 def make_env(args, render_mode=None):
     """Makes one environment: obs (obs_dim,) float32, actions (action_dim,).
 
@@ -256,11 +217,15 @@ def make_env(args, render_mode=None):
     # Gymnasium's checks of the first steps help authors of environments, but take time
     env = gym.make(args.env_id, args.max_episode_steps, disable_env_checker=True, **kwargs)
     actions = env.action_space
-    if not isinstance(actions, spaces.Box) or not np.issubdtype(actions.dtype, np.floating):
-        raise TypeError(f"{args.env_id} has actions {actions}; colored noise needs real numbers")
-    if args.rescale_actions and not actions.is_bounded():
-        raise ValueError(f"--rescale-actions needs bounds, {args.env_id} has {actions}")
-    return FlatEnv(env, args.rescale_actions)
+    is_vector = isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1
+    if not is_vector or not np.issubdtype(actions.dtype, np.floating):
+        raise TypeError(f"{args.env_id} has actions {actions}: a vector of real numbers is needed")
+    if args.rescale_actions:
+        if not actions.is_bounded():
+            raise ValueError(f"--rescale-actions needs bounds, {args.env_id} has {actions}")
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    env = gym.wrappers.FlattenObservation(env)
+    return gym.wrappers.DtypeObservation(env, np.float32)
 
 
 def make_vector_env(args, n_envs):
@@ -483,7 +448,6 @@ def evaluate_due(run, agent, acting, envs, global_step, args, bar):
             returns, lengths = evaluate(numpy_policy(agent.actor_mean), envs, seeds)
         run.add_evaluation(step, returns, lengths, acting)
         bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
-        seed_global_generators(args.seed, 3, global_step)  # evaluations may have drawn from them
 
 
 # --- The run's folder
@@ -627,22 +591,16 @@ class Run:
 # --- The whole run
 def make_seeds(n, *key):
     """n independent seeds below 2^32, determined by the key: args.seed, a number for the purpose (0
-    networks and noise, 1 environments, 2 evaluation, 3 global generators), and the step."""
+    networks and noise, 1 environments, 2 evaluation), and the step."""
     return np.random.SeedSequence(key).generate_state(n).tolist()
-
-
-def seed_global_generators(*key):
-    """Seeds those of random and numpy, from which some environments draw."""
-    seeds = make_seeds(2, *key)
-    random.seed(seeds[0])
-    np.random.seed(seeds[1])  # noqa: NPY002
 
 
 def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=learn,
          make_optimizer=make_optimizer):  # fmt: skip
     """Trains and evaluates as `args` say. Other methods replace the other arguments."""
     torch.set_num_threads(1)
-    seed_global_generators(args.seed, 3, 0)  # before environments are made: some draw then
+    random.seed(args.seed)  # some environments draw from these, also when they are made
+    np.random.seed(args.seed)  # noqa: NPY002
     envs, eval_envs = make_vector_env(args, args.n_envs), make_vector_env(args, args.eval_episodes)
     acting = {}  # all that acts, for best.pt
     if args.normalize_obs or args.normalize_rewards:
@@ -676,7 +634,6 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
                 part.load_state_dict(run.checkpoint[name])
         run.start(global_step)
         # The state of environments cannot be saved: after a resume they begin new episodes
-        seed_global_generators(args.seed, 3, global_step)
         obs, _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
         steps_per_update = args.n_steps * args.n_envs
         total = math.ceil(args.total_timesteps / steps_per_update) * steps_per_update
