@@ -97,6 +97,23 @@ def run_edited(tmp_path, read_events):
     return run
 
 
+@pytest.fixture
+def fill_buffer():
+    """fill_buffer(sb3, batch) puts a batch of ours into SB3's rollout buffer, in the same order."""
+
+    def fill(sb3, batch):
+        buffer = sb3.rollout_buffer
+        buffer.reset()
+        obs, actions, logprobs, advantages, returns, _ = (x.numpy() for x in batch)
+        buffer.observations, buffer.actions, buffer.log_probs = obs, actions, logprobs[:, None]
+        buffer.advantages, buffer.returns = advantages[:, None], returns[:, None]
+        buffer.values = buffer.returns * 0
+        buffer.full = buffer.generator_ready = True  # flattened already
+        sb3._setup_learn(1)
+
+    return fill
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """With -n 2: the worker that is done first takes over tests of the other."""

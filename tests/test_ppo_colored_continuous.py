@@ -95,18 +95,6 @@ def random_minibatch(agent, n=N_STEPS * N_ENVS):
     return obs, actions, logprobs, 2 * torch.randn(n) + 1, 3 * torch.randn(n), torch.randn(n)
 
 
-def fill_buffer(sb3, minibatch):
-    """Puts a minibatch into SB3's rollout buffer in the same order, flattened already."""
-    buffer = sb3.rollout_buffer
-    buffer.reset()
-    obs, actions, logprobs, advantages, returns, _ = (x.numpy() for x in minibatch)
-    buffer.observations, buffer.actions, buffer.log_probs = obs, actions, logprobs[:, None]
-    buffer.advantages, buffer.returns = advantages[:, None], returns[:, None]
-    buffer.values = np.zeros_like(buffer.returns)
-    buffer.full = buffer.generator_ready = True
-    sb3._setup_learn(1)
-
-
 def parameters(agent):
     return nn.utils.parameters_to_vector(agent.parameters()).detach()
 
@@ -132,7 +120,7 @@ def test_initial_weights_have_the_same_law():
          dict(normalize_advantage=False, ent_coef=0.03, vf_coef=0.7, clip_range=0.1)),
     ],
 )  # fmt: skip
-def test_loss_and_gradient(flags, settings):
+def test_loss_and_gradient(fill_buffer, flags, settings):
     agent, sb3, args = make_pair(flags, **settings)
     minibatch = random_minibatch(agent)
     loss, _ = ppo.ppo_loss(agent, minibatch, args)
@@ -153,7 +141,7 @@ def test_loss_and_gradient(flags, settings):
 
 
 @pytest.mark.parametrize("compile", [False, True])
-def test_parameters_after_steps_of_adam(compile, capsys):
+def test_parameters_after_steps_of_adam(fill_buffer, compile, capsys):
     """At falling rates, eager and compiled; eager, the last of a smaller minibatch."""
     agent, sb3, args = make_pair()
     optimizer = ppo.make_optimizer(agent, args)

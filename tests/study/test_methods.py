@@ -73,18 +73,6 @@ def random_batch(agent, seed=2):
     return obs, actions, logprobs, 2 * torch.randn(SIZE) + 1, torch.randn(SIZE), torch.randn(SIZE)
 
 
-def fill_buffer(theirs, batch):
-    """Puts a batch into their rollout buffer in the same order, flattened already."""
-    buffer = theirs.rollout_buffer
-    buffer.reset()
-    obs, actions, logprobs, advantages, returns, _ = (x.numpy() for x in batch)
-    buffer.observations, buffer.actions, buffer.log_probs = obs, actions, logprobs[:, None]
-    buffer.advantages, buffer.returns = advantages[:, None], returns[:, None]
-    buffer.values = np.zeros_like(buffer.returns)
-    buffer.full = buffer.generator_ready = True
-    theirs._setup_learn(1)
-
-
 def learn(method, agent, optimizer, batch, args):
     """An update, as ppo.main makes it with what the method replaces."""
     replaces = {"loss": ppo.ppo_loss, "learn": ppo.learn} | methods.METHODS[method]["replaces"]
@@ -92,7 +80,7 @@ def learn(method, agent, optimizer, batch, args):
     return replaces["learn"](agent, optimizer, batch, gradients, args)
 
 
-def test_a2c_after_five_updates():
+def test_a2c_after_five_updates(fill_buffer):
     agent, theirs, args = make_pair(A2C, "a2c")
     optimizer, before = methods.a2c_optimizer(agent, args), flat(agent.parameters())
     for seed in range(5):
@@ -109,7 +97,7 @@ def test_a2c_after_five_updates():
     [(0.1, 0, 0.1, 0.8, 1), (0.3, 1, 0.01, 0.8, 2), (0.3, 1, 0.01, 1.0, 10)],
     ids=["accepted", "shrunk", "refused"],
 )
-def test_trpo(monkeypatch, noise, seed, damping, shrink, steps):
+def test_trpo(monkeypatch, fill_buffer, noise, seed, damping, shrink, steps):
     """The actor's step and line search, and ten of the critic's."""
     settings = dict(batch_size=SIZE, line_search_shrinking_factor=shrink, cg_damping=damping)
     agent, theirs, args = make_pair(TRPO, "trpo", noise, seed, **settings)
@@ -140,7 +128,7 @@ def gsde_pair():
     return agent, theirs, args
 
 
-def test_gsde_density_entropy_and_gradient():
+def test_gsde_density_entropy_and_gradient(fill_buffer):
     agent, theirs, args = gsde_pair()
     obs, actions, logprobs, *rest = random_batch(agent)
     batch = (obs, actions, logprobs + 0.3 * torch.randn(SIZE), *rest)
