@@ -249,12 +249,12 @@ def exploration(agent, noise, args):
 
     You can replace the noise by another object. It needs sample(n_steps), which returns a tensor
     (n_steps, n_envs, action_dim) in which each value by itself is Gaussian with mean 0 and variance
-    1, and, for checkpoints, state_dict() and load_state_dict(state).
+    1 (ours: about 1), and, for checkpoints, state_dict() and load_state_dict(state).
     """
     mean, std = numpy_policy(agent.actor_mean), agent.std().detach().cpu().numpy()
-    shape = (args.n_steps, args.n_envs, len(std))
     # These lines are the paper: noise that is correlated over time, in place of white noise (Eq. 2)
-    eps = (torch.randn(shape) if args.vanilla else noise.sample(args.n_steps)).numpy()
+    eps = noise.sample(args.n_steps)
+    eps = (torch.randn(eps.shape) if args.vanilla else eps).numpy()
     return lambda obs, t: mean(obs) + std * eps[t]
 
 
@@ -617,6 +617,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         torch.manual_seed(init_seed)
         agent = make_agent(obs_dim, action_dim).to(args.device)
         optimizer = make_optimizer(agent, args)
+        learning_rates = [group["lr"] for group in optimizer.param_groups]
         sizes = args.n_envs, action_dim, args.noise_seq_len
         noise = ColoredNoiseProcess(args.beta, *sizes, noise_seed)
         gradients = functools.partial(loss_gradients, loss)
@@ -649,8 +650,8 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
             if global_step == total:
                 break
             if args.anneal_lr:
-                for group in optimizer.param_groups:
-                    group["lr"] = args.learning_rate * (1 - global_step / total)
+                for group, rate in zip(optimizer.param_groups, learning_rates, strict=True):
+                    group["lr"] = rate * (1 - global_step / total)
             act = exploration(agent, noise, args)
             batch, obs, ended = collect(agent, act, envs, obs, so_far, args, bar)
             losses = learn(agent, optimizer, batch, gradients, args)

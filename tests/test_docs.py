@@ -252,7 +252,8 @@ def test_ornstein_uhlenbeck_noise(run_edited):
     agent.actor_mean[-1].bias.data.zero_()
     agent.log_std.data.zero_()
     torch.manual_seed(0)
-    act, obs = module.exploration(agent, None, args), np.zeros((2, 3), np.float32)
+    noise, obs = module.ColoredNoiseProcess(1, 2, 1), np.zeros((2, 3), np.float32)
+    act = module.exploration(agent, noise, args)
     eps = np.array([act(obs, t) for t in range(20_000)])
     assert eps.var() == pytest.approx(1, abs=0.06)
     for lag in (1, 5, 10):

@@ -601,11 +601,33 @@ def test_another_noise_and_an_agent_changed_in_the_loop(run_edited):
         batches.append((batch[1].clone(), agent.actor_mean(batch[0]), agent.std()))
         return {}
 
-    edits = (LOOP, change + LOOP), ("noise.sample(args.n_steps)", "torch.ones(shape)")
-    run_edited(*edits, learn=learn)
+    ones = "noise.sample(args.n_steps)", "torch.ones(args.n_steps, args.n_envs, 1)"
+    run_edited((LOOP, change + LOOP), ones, learn=learn)
     for i, (actions, means, std) in enumerate(batches):
         assert means.mean() > 1.5 * (i + 1) and std.item() == pytest.approx(np.exp(-i - 1))
         torch.testing.assert_close(actions, means + std)
+
+
+def test_learning_rates_of_the_actor_and_the_critic_are_both_annealed(run_edited):
+    groups = """[
+        {"params": [*agent.actor_mean.parameters(), agent.log_std], "lr": 0.0},
+        {"params": agent.critic.parameters(), "lr": 1e-2},
+    ]"""
+    start, *_ = run_edited(learn=lambda *_: {})
+    agent, *_ = run_edited(("Adam(trainable(agent)", f"Adam({groups}"), flags="--anneal-lr")
+    change = [
+        (a - b).abs().max() for a, b in zip(agent.parameters(), start.parameters(), strict=True)
+    ]
+    assert max(change[:7]) == 0 and min(change[7:]) > 1e-3
+
+
+@pytest.mark.parametrize("flags", ["", "--vanilla"])
+def test_one_std_for_all_action_dimensions(flags):
+    agent, args = ppo.Agent(3, 2), parse(flags)
+    agent.log_std = nn.Parameter(torch.zeros(1))
+    act = ppo.exploration(agent, ColoredNoiseProcess(0.5, 4, 2), args)
+    actions = act(np.zeros((4, 3), np.float32), 0)
+    assert len(np.unique(actions)) == 8
 
 
 def test_hooks_and_dropout_in_the_policy():
