@@ -220,9 +220,12 @@ def make_env(args, render_mode=None):
     is_vector = isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1
     if not is_vector or not np.issubdtype(actions.dtype, np.floating):
         raise TypeError(f"{args.env_id} has actions {actions}: a vector of real numbers is needed")
+    actions.seed(args.seed)  # some environments draw from it
     if args.rescale_actions:
         if not actions.is_bounded():
             raise ValueError(f"--rescale-actions needs bounds, {args.env_id} has {actions}")
+        low, high = actions.low, actions.high  # rounding may leave them
+        env = gym.wrappers.TransformAction(env, lambda a: np.clip(a, low, high), actions)
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     env = gym.wrappers.FlattenObservation(env)
     return gym.wrappers.DtypeObservation(env, np.float32)

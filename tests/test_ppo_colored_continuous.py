@@ -249,17 +249,17 @@ def test_evaluation_counts_whole_episodes_once():
 
 
 class Draws(gym.Env):
-    """Draws from the global generators, also when it is made."""
+    """Draws from all generators that an environment may use, also when it is made."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
     def __init__(self):
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
         self.made = np.random.normal() + random.random()  # noqa: NPY002
 
     def reset(self, seed=None, options=None):
         drawn = np.random.normal() + random.random() + torch.randn(()).item()  # noqa: NPY002
-        return np.float32([drawn + self.made]), {}
+        return np.float32([drawn + self.made + self.action_space.sample()[0]]), {}
 
     def step(self, action):
         obs, _ = self.reset()

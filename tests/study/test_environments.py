@@ -61,15 +61,18 @@ def test_observations_are_one_float32_vector(monkeypatch):
         np.testing.assert_array_equal(obs, np.float32([1, 2, 3, 255, 0, 1, 0, *floats]))
 
 
-def test_rescaled_actions(monkeypatch):
-    space = gym.spaces.Box(np.float32([-100, 0.25]), np.float32([50, 0.5]))
+def test_rescaled_actions_never_leave_the_bounds(monkeypatch):
+    rng = np.random.default_rng(0)
+    low, high = np.sort(rng.normal(size=(2, 2000)) * 10 ** rng.uniform(-2, 2, 2000), axis=0)
+    space = gym.spaces.Box(np.float32(low), np.float32(high))
     monkeypatch.setattr(Plain, "action_space", space)
-    env = ppo.make_env(parse("--env-id Plain-v0 --rescale-actions"))
-    assert env.action_space == gym.spaces.Box(-1, 1, (2,))
-    env.reset(seed=0)
-    for value, expected in ((-1, space.low), (0, (-25, 0.375)), (1, space.high)):
-        env.step(np.full(2, value, np.float32))
-        np.testing.assert_allclose(env.unwrapped.last_action, expected, rtol=1e-6)
+    env = ppo.make_env(parse("--env-id Plain-v0 --rescale-actions --no-envpool"))
+    assert env.action_space == gym.spaces.Box(-1, 1, (2000,))
+    for value in (-1, 0, 0.4, 1):
+        env.reset(seed=0)
+        env.step(np.full(2000, value, np.float32))
+        expected = space.low + (value + 1) / 2 * (space.high - space.low)
+        np.testing.assert_allclose(env.unwrapped.last_action, expected, rtol=1e-4, atol=1e-4)
     monkeypatch.setattr(Plain, "action_space", gym.spaces.Box(-np.inf, np.inf, (1,)))
     with pytest.raises(ValueError, match="--rescale-actions needs bounds"):
         ppo.make_env(parse("--env-id Plain-v0 --rescale-actions"))
