@@ -228,7 +228,8 @@ def make_env(args, render_mode=None):
         env = gym.wrappers.TransformAction(env, lambda a: np.clip(a, low, high), actions)
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     env = gym.wrappers.FlattenObservation(env)
-    return gym.wrappers.DtypeObservation(env, np.float32)
+    space = gym.spaces.Box(-np.inf, np.inf, env.observation_space.shape)  # float32
+    return gym.wrappers.TransformObservation(env, np.float32, space)
 
 
 def make_vector_env(args, n_envs):

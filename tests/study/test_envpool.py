@@ -108,7 +108,7 @@ def test_each_step_is_the_same(env_id):
     episodes that start in the same state.
     """
     n_envs, pool, env = 4, make_pool(env_id, 4), make_single(env_id)
-    assert pool.single_observation_space.shape == env.observation_space.shape
+    assert pool.single_observation_space == env.observation_space
     actions = pool.single_action_space
     assert actions == gym.spaces.Box(env.action_space.low, env.action_space.high)  # float32
     assert pool.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
