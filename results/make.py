@@ -297,7 +297,7 @@ def friction():
 def speed():
     """Microseconds per training step of the script and the paper's stack, with evaluations."""
     table = pd.read_csv(RESULTS / "speed.csv")
-    us = table.pivot_table("total us", "env_id", "contender", sort=False)
+    us = table.pivot_table("us", "env_id", "contender", sort=False)
     us = us[["this script", "this script, --no-envpool", "the paper's stack"]].dropna()
     faster = (us["the paper's stack"] / us["this script"]).map("{:.1f}".format)
     return markdown(
