@@ -17,11 +17,11 @@ import contextlib
 import copy
 import functools
 import importlib.metadata
+import importlib.util
 import json
 import math
 import os
 import random
-import re
 import signal
 import subprocess
 import sys
@@ -41,12 +41,9 @@ from tqdm import tqdm
 
 from colored_noise import ColoredNoiseProcess, projected_beta
 
-try:
+study = None
+if importlib.util.find_spec("study"):
     from study import environments as study  # EnvPool, threads, normalization, the paper's tasks
-except ModuleNotFoundError as error:
-    if error.name != "study":
-        raise
-    study = None
 
 
 def beta_or_auto(text):
@@ -106,8 +103,7 @@ def parse_args(argv=None, **defaults):
     parser.set_defaults(**{"method": "ppo", **defaults})  # other methods: study/methods.py
     args = parser.parse_args(argv)
 
-    counts = args.total_timesteps, args.eval_freq, args.eval_episodes
-    if min(*counts, args.n_envs, args.n_steps, args.batch_size) < 1:
+    if min(args.eval_freq, args.eval_episodes, args.n_envs, args.n_steps, args.batch_size) < 1:
         parser.error("numbers of steps, episodes and environments must be positive")
     last_evaluation = args.total_timesteps // args.eval_freq * args.eval_freq
     if last_evaluation < args.n_envs * args.n_steps:
@@ -135,10 +131,8 @@ def layer_init(layer, gain=2**0.5):
 
 class Agent(nn.Module):
     """Separate actor and critic. All layers work but BatchNorm and Dropout, which act differently
-    in training. Parameters with requires_grad=False are not learned.
-
-    Rollout and evaluation call actor_mean, std and critic: an edit in forward alone changes no
-    action.
+    in training. Parameters with requires_grad=False are not learned. Rollout and evaluation call
+    actor_mean, std and critic: an edit in forward alone changes no action.
     """
 
     def __init__(self, obs_dim, action_dim):
@@ -163,10 +157,7 @@ class Agent(nn.Module):
         return self.log_std.exp()  # (action_dim,), the same in all states
 
     def forward(self, obs, actions):
-        """obs (batch, obs_dim), actions (batch, action_dim).
-
-        Returns logprobs (batch,), entropy () and values (batch,).
-        """
+        """obs (n, obs_dim), actions (n, action_dim) -> logprobs (n,), entropy (), values (n,)."""
         # The density of a single step, as if eps were white. Each eps is Gaussian by itself, and
         # PPO's objective is made of single steps. The paper does so, too (docs/lesson.md).
         policy = Normal(self.actor_mean(obs), self.std(), validate_args=False)
@@ -189,12 +180,11 @@ def numpy_policy(actor):
     if hooks or not all(type(layer) in known for layer in layers):
         module, device = copy.deepcopy(actor).eval(), next(actor.parameters()).device
         return lambda obs: module(torch.as_tensor(obs, device=device)).detach().cpu().numpy()
-    functions = [known[type(layer)] for layer in layers]
     weights = [[p.detach().cpu().numpy().T.copy() for p in m.parameters()] for m in layers]
 
     def policy(x):
-        for function, parameters in zip(functions, weights, strict=True):
-            x = function(x, *parameters)
+        for layer, parameters in zip(layers, weights, strict=True):
+            x = known[type(layer)](x, *parameters)
         return x
 
     return policy
@@ -212,24 +202,21 @@ def make_env(args, render_mode=None):
 
         if args.max_episode_steps:  # the task's own limit, in seconds, would come first
             kwargs["task_kwargs"] = {"time_limit": math.inf} | kwargs.get("task_kwargs", {})
-    if os.getcwd() not in sys.path:  # where my_env.py of my_env:MyEnv-v0 may be
-        sys.path.append(os.getcwd())
     # Gymnasium's checks of the first steps help authors of environments, but take time
     env = gym.make(args.env_id, args.max_episode_steps, disable_env_checker=True, **kwargs)
-    actions = env.action_space
-    is_vector = isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1
-    if not is_vector or not np.issubdtype(actions.dtype, np.floating):
-        raise TypeError(f"{args.env_id} has actions {actions}: a vector of real numbers is needed")
-    actions.seed(args.seed)  # some environments draw from it
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or space.dtype.kind != "f":
+        raise TypeError(f"{args.env_id} has actions {space}: a vector of real numbers is needed")
+    space.seed(args.seed)  # some environments draw from it
     if args.rescale_actions:
-        if not actions.is_bounded():
-            raise ValueError(f"--rescale-actions needs bounds, {args.env_id} has {actions}")
-        low, high = actions.low, actions.high  # rounding may leave them
-        env = gym.wrappers.TransformAction(env, lambda a: np.clip(a, low, high), actions)
+        if not space.is_bounded():
+            raise ValueError(f"--rescale-actions needs bounds, {args.env_id} has {space}")
+        # Clipped, as rounding may leave the bounds
+        env = gym.wrappers.TransformAction(env, lambda a: np.clip(a, space.low, space.high), space)
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     env = gym.wrappers.FlattenObservation(env)
-    space = gym.spaces.Box(-np.inf, np.inf, env.observation_space.shape)  # float32
-    return gym.wrappers.TransformObservation(env, np.float32, space)
+    observations = gym.spaces.Box(-np.inf, np.inf, env.observation_space.shape)  # float32
+    return gym.wrappers.TransformObservation(env, np.float32, observations)
 
 
 def make_vector_env(args, n_envs):
@@ -438,18 +425,18 @@ def evaluate(policy, envs, seeds, max_steps=1_000_000):
     raise RuntimeError(f"no end of an episode in {max_steps} steps: set --max-episode-steps")
 
 
-def evaluate_due(run, agent, acting, envs, global_step, args, bar):
+def evaluate_due(run, acting, envs, global_step, args, bar):
     """Makes the evaluations that fall before the next update.
 
     An evaluation at step t is of the policy that acts at step t. With 8,192 steps per update, the
     policy of step 8,192 acts until step 16,383, so it is the one evaluated for step 10,240.
     """
     next_update = global_step + args.n_steps * args.n_envs
-    first = max(1, math.ceil(global_step / args.eval_freq)) * args.eval_freq
+    first = len(run.rows) * args.eval_freq  # rows: the header, and one for each evaluation
     for step in range(first, min(next_update, args.total_timesteps + 1), args.eval_freq):
         if step == first or not args.eval_once_per_policy:
             seeds = make_seeds(args.eval_episodes, args.seed, 2, step)
-            returns, lengths = evaluate(numpy_policy(agent.actor_mean), envs, seeds)
+            returns, lengths = evaluate(numpy_policy(acting["agent"].actor_mean), envs, seeds)
         run.add_evaluation(step, returns, lengths, acting)
         bar.set_postfix_str(f"last evaluation {returns.mean():.4g}", refresh=False)
 
@@ -459,8 +446,8 @@ def run_path(args):
     """Path of a run's folder: it shows the experiment, environment, beta, n_envs and seed."""
     beta = "beta_" + ("auto" if args.beta_auto else "_".join(f"{b:g}" for b in args.beta))
     beta = "gsde" if args.method == "gsde" else "vanilla" if args.vanilla else beta
-    path = Path(args.runs_dir) / args.exp_name / re.sub(r"[/:\\]", "_", args.env_id) / beta
-    return path / f"n_envs_{args.n_envs}" / f"seed_{args.seed}"
+    env, n_envs, seed = args.env_id.replace("/", "_"), f"n_envs_{args.n_envs}", f"seed_{args.seed}"
+    return Path(args.runs_dir, args.exp_name, env.replace(":", "_"), beta, n_envs, seed)
 
 
 def lock(path):
@@ -485,72 +472,63 @@ def write_file(path, content):
     os.replace(temporary, path)
 
 
-def git_commit():
-    """Commit of this file, with "-dirty" where the checkout differs from it; None without git."""
-    command = "git describe --always --dirty --abbrev=40 --exclude='*'"
-    how = {"shell": True, "cwd": Path(__file__).parent, "capture_output": True, "text": True}
-    return subprocess.run(command, **how).stdout.strip() or None
-
-
 class Run:
     """The folder of a run: what it leaves behind, and what --resume continues from.
 
-    Attributes: `complete`, whether there is nothing to do; `checkpoint`, a dict to continue from,
-    or None. Nothing is changed before start().
+    Attributes: `complete`, whether there is nothing to do; `checkpoint`, the state to start from;
+    `rows`, the lines of evaluations.csv. Resuming loads them from the checkpoint and changes no
+    file: what was evaluated after the checkpoint is evaluated again.
     """
 
-    # These do not change the result: they may differ between a run and its --resume
-    FREE_ARGUMENTS = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "track"}
-
     def __init__(self, args):
-        self.args, self.path, self.checkpoint = args, run_path(args), None
-        self.start_time, self.saved_time, self.best_return = time.time(), 0.0, -math.inf
-        summary, checkpoint = self.path / "summary.json", self.path / "checkpoint.pt"
-        self.complete = summary.exists() and not args.overwrite
-        if args.overwrite or not (summary.exists() or checkpoint.exists()):
-            return
-        old = json.loads((self.path / "config.json").read_text())["args"]
-        for name, value in vars(args).items():
-            if old.get(name) != value and name not in self.FREE_ARGUMENTS:
-                found = f"{self.path} holds a run with {name} {old.get(name)}, not {value}"
-                raise FileExistsError(f"{found}: choose another --exp-name, or --overwrite")
-        if self.complete:
-            return
-        if not args.resume:
-            raise FileExistsError(f"{self.path} is unfinished: use --resume or --overwrite")
-        self.checkpoint = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        self.best_return = self.checkpoint["best_return"]
-        self.start_time -= self.checkpoint["wall_seconds"]  # so wall_seconds continues
-
-    def start(self, global_step=0):
-        """Clears the folder, or cuts its files back to global_step, that of the checkpoint."""
-        table, rows = self.path / "evaluations.csv", ["step,return_mean,return_std,length_mean\n"]
-        if global_step:
-            # The header, and a row for each earlier evaluation
-            n_rows = math.ceil(global_step / self.args.eval_freq)
-            rows = table.read_text().splitlines(keepends=True)[:n_rows]
-        else:
+        self.args, self.path, self.saved_time = args, run_path(args), 0.0
+        if args.overwrite:
             for name in ("summary.json", "checkpoint.pt", "best.pt", "events.out.tfevents.*"):
                 for file in self.path.glob(name):
                     file.unlink()
+        config, checkpoint = self.path / "config.json", self.path / "checkpoint.pt"
+        self.complete = (self.path / "summary.json").exists()
+        if self.complete or checkpoint.exists():
+            old = json.loads(config.read_text())["args"]
+            # These do not change the result: they may differ between a run and its --resume
+            free = {"resume", "overwrite", "runs_dir", "device", "compile", "threads", "track"}
+            for name, value in vars(args).items():
+                if old.get(name) != value and name not in free:
+                    found = f"{self.path} holds a run with {name} {old.get(name)}, not {value}"
+                    raise FileExistsError(f"{found}: choose another --exp-name, or --overwrite")
+        if self.complete:
+            print(f"nothing was run, {self.path} is complete: use --overwrite or --exp-name NAME")
+            return
+        self.checkpoint = {"global_step": 0, "wall_seconds": 0.0, "best_return": -math.inf}
+        self.checkpoint["rows"] = ["step,return_mean,return_std,length_mean\n"]
+        if not checkpoint.exists():  # a new run
             versions = {x.name: x.version for x in importlib.metadata.distributions()}
-            config = {"args": vars(self.args), "git_commit": git_commit(), "versions": versions}
-            write_file(self.path / "config.json", json.dumps(config, indent=2) + "\n")
-        write_file(table, "".join(rows))
-        if self.args.track:
+            git = "git describe --always --dirty --abbrev=40 --exclude='*'"  # -dirty: not committed
+            how = {"shell": True, "cwd": Path(__file__).parent, "capture_output": True}
+            commit = subprocess.run(git, **how, text=True).stdout.strip() or None  # no git: None
+            content = {"args": vars(args), "git_commit": commit, "versions": versions}
+            write_file(config, json.dumps(content, indent=2) + "\n")
+            write_file(self.path / "evaluations.csv", "".join(self.checkpoint["rows"]))
+        elif args.resume:
+            self.checkpoint = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        else:
+            raise FileExistsError(f"{self.path} is unfinished: use --resume or --overwrite")
+        self.rows, self.best_return = self.checkpoint["rows"], self.checkpoint["best_return"]
+        self.start_time = time.time() - self.checkpoint["wall_seconds"]  # it counts on
+        if args.track:
             import wandb
 
             wandb.init(project="ppo_colored_noise", name=str(self.path), sync_tensorboard=True)
         # TensorBoard hides what an earlier process has logged from purge_step on
-        self.writer = SummaryWriter(str(self.path), purge_step=global_step or None)
+        self.writer = SummaryWriter(str(self.path), purge_step=self.checkpoint["global_step"])
 
     def add_evaluation(self, step, returns, lengths, acting):
         """Writes a row of evaluations.csv; and best.pt, the policy, if its return is the best."""
         mean, std, length = returns.mean(), returns.std(), lengths.mean()
         if not np.isfinite(mean):
             raise FloatingPointError(f"return {mean} in {self.args.env_id}, evaluated at {step}")
-        with open(self.path / "evaluations.csv", "a") as file:
-            file.write(f"{step},{mean:.9g},{std:.9g},{length:.9g}\n")
+        self.rows.append(f"{step},{mean:.9g},{std:.9g},{length:.9g}\n")
+        write_file(self.path / "evaluations.csv", "".join(self.rows))
         if mean > self.best_return:
             self.best_return = mean.item()
             best = {name: part.state_dict() for name, part in acting.items()}
@@ -574,7 +552,7 @@ class Run:
         self.writer.flush()
         state = {name: part.state_dict() for name, part in parts.items()}
         state |= {"global_step": global_step, "torch_rng": torch.get_rng_state()}
-        state["best_return"] = self.best_return
+        state |= {"rows": self.rows, "best_return": self.best_return}
         state["wall_seconds"] = time.time() - self.start_time
         write_file(self.path / "checkpoint.pt", state)
         self.saved_time = time.time()
@@ -582,8 +560,7 @@ class Run:
     def finish(self, steps):
         """Writes summary.json, which makes the run complete, and says what is in it."""
         self.writer.close()
-        rows = (self.path / "evaluations.csv").read_text().splitlines()[1:]
-        returns = [float(row.split(",")[1]) for row in rows]
+        returns = [float(row.split(",")[1]) for row in self.rows[1:]]
         performance, seconds = sum(returns) / len(returns), time.time() - self.start_time
         summary = {"performance": performance, "final_return": returns[-1], "steps": steps}
         summary["wall_seconds"] = round(seconds, 1)
@@ -602,19 +579,12 @@ def make_seeds(n, *key):
 def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=learn,
          make_optimizer=make_optimizer):  # fmt: skip
     """Trains and evaluates as `args` say. Other methods replace the other arguments."""
+    sys.path.append(os.getcwd())  # where my_env.py of my_env:MyEnv-v0 may be
     torch.set_num_threads(1)
     random.seed(args.seed)  # some environments draw from these, also when they are made
     np.random.seed(args.seed)  # noqa: NPY002
     envs, eval_envs = make_vector_env(args, args.n_envs), make_vector_env(args, args.eval_episodes)
-    acting = {}  # all that acts, for best.pt
-    if args.normalize_obs or args.normalize_rewards:
-        envs = acting["normalization"] = study.NormalizedVectorEnv(envs, args)
-        eval_envs = envs.frozen(eval_envs)
     with contextlib.closing(envs), contextlib.closing(eval_envs), lock(run_path(args)):
-        run = Run(args)
-        if run.complete:
-            print(f"nothing was run, {run.path} is complete: use --overwrite or --exp-name NAME")
-            return
         obs_dim = envs.single_observation_space.shape[0]
         action_dim = envs.single_action_space.shape[0]
         init_seed, noise_seed = make_seeds(2, args.seed, 0)
@@ -624,20 +594,23 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         learning_rates = [group["lr"] for group in optimizer.param_groups]
         sizes = args.n_envs, action_dim, args.noise_seq_len
         noise = ColoredNoiseProcess(args.beta, *sizes, noise_seed)
-        gradients = functools.partial(loss_gradients, loss)
-        gradients = compiled(gradients) if args.compile else gradients
-
-        acting["agent"] = agent
+        acting = {"agent": agent}  # all that acts, for best.pt
+        if args.normalize_obs or args.normalize_rewards:
+            envs = acting["normalization"] = study.NormalizedVectorEnv(envs, args)
+            eval_envs = envs.frozen(eval_envs)
         saved = {**acting, "optimizer": optimizer, "noise": noise}  # for checkpoint.pt
-        global_step = 0
-        if run.checkpoint:
-            global_step = run.checkpoint["global_step"]
+        run = Run(args)
+        if run.complete:
+            return
+        global_step = run.checkpoint["global_step"]
+        if global_step:
             torch.set_rng_state(run.checkpoint["torch_rng"])
-            groups = optimizer.state_dict()["param_groups"]  # the learning rate as it is now
-            run.checkpoint["optimizer"]["param_groups"] = groups
+            # The learning rate is that of make_optimizer now
+            run.checkpoint["optimizer"]["param_groups"] = optimizer.state_dict()["param_groups"]
             for name, part in saved.items():
                 part.load_state_dict(run.checkpoint[name])
-        run.start(global_step)
+        gradients = functools.partial(loss_gradients, loss)
+        gradients = compiled(gradients) if args.compile else gradients
         # The state of environments cannot be saved: after a resume they begin new episodes
         obs, _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
         steps_per_update = args.n_steps * args.n_envs
@@ -650,7 +623,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         bar = tqdm(total=total, initial=global_step, unit=" steps", unit_scale=True)
         bar.mininterval = 0.5 if sys.stderr.isatty() else 60  # seconds
         while True:
-            evaluate_due(run, agent, acting, eval_envs, global_step, args, bar)
+            evaluate_due(run, acting, eval_envs, global_step, args, bar)
             if global_step == total:
                 break
             if args.anneal_lr:

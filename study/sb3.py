@@ -87,12 +87,10 @@ def main(args):
     with ppo.lock(ppo.run_path(args)):
         run = ppo.Run(args)
         if run.complete:
-            print(f"nothing was run, {run.path} is complete: use --overwrite or --exp-name NAME")
             return
         _, eval_seed = ppo.make_seeds(2, args.seed, 5)
         model, eval_envs = make_model(args), make_envs(args, args.eval_episodes, eval_seed)
         how = {"n_eval_episodes": args.eval_episodes, "return_episode_rewards": True}
-        run.start()
         for step in range(args.eval_freq, args.total_timesteps + 1, args.eval_freq):
             model.learn(args.eval_freq, reset_num_timesteps=False)
             returns, lengths = map(np.array, evaluate_policy(model, eval_envs, **how))
