@@ -17,6 +17,7 @@ from typing import NamedTuple
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
 
 GOAL_RADIUS = 0.6  # m, in the plane
 STEP_REWARD = -0.0001  # a step that does not reach the goal
@@ -154,18 +155,17 @@ def add_maze(spec, cells, scale, goal):
     box = dict(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, contype=1, conaffinity=1)
     for i, (c, x, y) in enumerate(cells):
         if c == "#":
-            wall = spec.worldbody.add_geom(**box, name=f"wall_{i}", pos=[x, y, height / 2])
-            wall.rgba = [0.35, 0.4, 0.5, 1]
+            place = {"name": f"wall_{i}", "pos": [x, y, height / 2]}
+            spec.worldbody.add_geom(**box, **place, rgba=[0.35, 0.4, 0.5, 1])
         elif c == "M":
             body = spec.worldbody.add_body(name=f"block_{i}", pos=[x, y, height / 2])
             body.add_geom(**box, name=f"block_{i}", mass=0.0002, rgba=[0.75, 0.15, 0.2, 1])
+            slide = dict(type=mujoco.mjtJoint.mjJNT_SLIDE, margin=0.01, limited=0, armature=0)
             for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0])):
-                joint = body.add_joint(name=f"block_{i}_{name}", axis=axis)
-                joint.type, joint.margin = mujoco.mjtJoint.mjJNT_SLIDE, 0.01
-                joint.limited, joint.armature, joint.damping = 0, 0, [0, 0, 0]
+                body.add_joint(**slide, damping=[0, 0, 0], name=f"block_{i}_{name}", axis=axis)
     # A post as wide as the goal. It is higher than the walls, as some goals are inside of one.
-    post = spec.worldbody.add_site(name="goal", pos=[*goal, 0.7 * height], rgba=[0.1, 0.7, 0.1, 1])
-    post.type, post.size = mujoco.mjtGeom.mjGEOM_CYLINDER, [GOAL_RADIUS, 0.7 * height, 0]
+    post = dict(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[GOAL_RADIUS, 0.7 * height, 0])
+    spec.worldbody.add_site(**post, pos=[*goal, 0.7 * height], rgba=[0.1, 0.7, 0.1, 1])
 
 
 def set_old_capsule_inertia(model):
@@ -209,17 +209,15 @@ def wall_faces(cells, scale):
 
 def first_crossing(faces, start, end):
     """The first face that the segment start-end crosses: (distance / length, face), or None."""
-    nearest = None
-    delta = (end[0] - start[0], end[1] - start[1])
+    crossed, delta = [], (end[0] - start[0], end[1] - start[1])
     for face in faces:
         axis, across, low, high = face
         a, b = start[axis] - across, end[axis] - across
         if a * b <= 0 and a != b:
             t = a / (a - b)
-            on_face = low <= start[1 - axis] + t * delta[1 - axis] <= high
-            if on_face and (nearest is None or t < nearest[0]):
-                nearest = (t, face)
-    return nearest
+            if low <= start[1 - axis] + t * delta[1 - axis] <= high:
+                crossed.append((t, face))
+    return min(crossed, default=None, key=lambda hit: hit[0])
 
 
 def reflect(faces, start, end):
@@ -235,7 +233,7 @@ def reflect(faces, start, end):
     return start if first_crossing(faces, start, arrival) else arrival
 
 
-class MazeEnv(gym.Env):
+class MazeEnv(MujocoEnv):
     """A robot that looks for a goal in a maze.
 
     Arguments:
@@ -256,35 +254,33 @@ class MazeEnv(gym.Env):
     Info: `success`, whether the goal is reached.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}
+    metadata = {"render_modes": ["rgb_array"]}
 
     def __init__(self, robot, maze, goal=None, old_capsule_inertia=True, render_mode=None):
-        self.robot, self.render_mode = robot, render_mode
-        timestep, self.substeps = TIMESTEPS[robot]
-        self.dt = timestep * self.substeps
-        self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         scale = MAZES[maze].scale[robot]
+        self.robot = robot
         self.goal = tuple(goal) if goal is not None else tuple(scale * c for c in MAZES[maze].goal)
-
         self.cells = read_grid(MAZES[maze].grid, scale)
         self.faces = wall_faces(self.cells, scale)
         self.model = build_model(robot, self.cells, scale, self.goal, old_capsule_inertia)
-        self.data = mujoco.MjData(self.model)
+        xy = np.array([(x, y) for _, x, y in self.cells])
+        camera = {"lookat": np.array([*(xy.min(0) + xy.max(0)) / 2, 0]), "azimuth": 90}
+        camera |= {"distance": 1.55 * np.ptp(xy, 0).max(), "elevation": -65}
+        how = {"camera_id": -1, "default_camera_config": camera}  # -1: that of this configuration
+        super().__init__(f"{robot}.xml", TIMESTEPS[robot][1], None, render_mode, **how)
+        self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.n_blocks = sum(c == "M" for c, _, _ in self.cells)
         # Of the robot. The coordinates of the blocks follow, two for each
         self.nq, self.nv = self.model.nq - 2 * self.n_blocks, self.model.nv - 2 * self.n_blocks
-
-        low, high = self.model.actuator_ctrlrange.astype(np.float32).T
-        self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
         obs_dim = self.nq + 3 * self.n_blocks + self.nv + 1
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (obs_dim,), np.float64)
         self._low, self._high = self.model.actuator_ctrlrange.T.copy()
-        self._renderer = None
 
-    def reset(self, *, seed=None, options=None):
-        """Starts an episode. The robot's coordinates and velocities are drawn near the model's."""
-        super().reset(seed=seed)
-        mujoco.mj_resetData(self.model, self.data)
+    def _initialize_simulation(self):  # in place of MujocoEnv's, which reads the XML file as it is
+        return self.model, mujoco.MjData(self.model)
+
+    def reset_model(self):
+        """Draws the robot's coordinates and velocities near the model's."""
         self._steps = 0
         self.data.qpos[: self.nq] += self.np_random.uniform(-0.1, 0.1, self.nq)
         if self.robot == "swimmer":
@@ -292,7 +288,7 @@ class MazeEnv(gym.Env):
         else:
             self.data.qvel[: self.nv] = 0.1 * self.np_random.standard_normal(self.nv)
         mujoco.mj_forward(self.model, self.data)
-        return self._observation(), {}
+        return self._observation()
 
     def step(self, action):
         """One step of `dt` seconds with an action of shape (action_dim,)."""
@@ -304,7 +300,7 @@ class MazeEnv(gym.Env):
             reward = 0.0
         else:
             self.data.ctrl[:] = action
-            mujoco.mj_step(self.model, self.data, self.substeps)
+            mujoco.mj_step(self.model, self.data, self.frame_skip)
             speed = math.dist(position, start) / self.dt
             reward = INNER_REWARD * (speed - CONTROL_COST * float(action @ action))
         reached = math.dist(position, self.goal) <= GOAL_RADIUS
@@ -334,20 +330,5 @@ class MazeEnv(gym.Env):
 
     def render(self):
         """The maze from above, RGB (480, 480, 3) uint8, if `render_mode` is "rgb_array"."""
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self.model, 480, 480)
-            xy = np.array([(x, y) for _, x, y in self.cells])
-            self._camera = mujoco.MjvCamera()
-            self._camera.lookat = [*(xy.min(0) + xy.max(0)) / 2, 0]
-            self._camera.distance = 1.55 * np.ptp(xy, 0).max()
-            self._camera.azimuth, self._camera.elevation = 90, -65
         mujoco.mj_kinematics(self.model, self.data)
-        self._renderer.update_scene(self.data, self._camera)
-        return self._renderer.render()
-
-    def close(self):
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        return super().render()
