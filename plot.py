@@ -39,7 +39,7 @@ from colored_noise import (
 )
 from study import claims, tables
 from study.environments import prepare_rendering
-from study.protocol import BETAS, COMPLEX, NAMES, SETTINGS
+from study.protocol import BETAS, COMPLEX, METHODS, NAMES, SETTINGS
 from study.runs import CELL, Unusable, comparable, differences, need, published, same_protocol
 from study.statistics import FEW, cells_intervals, mean_interval, standardize
 
@@ -560,19 +560,17 @@ def averaged(runs):
     return runs[~runs.env_id.isin(COMPLEX) & ~runs.vanilla]
 
 
-def results(methods, curves, betas):
-    """What `make_all` is to make of runs, as `select_methods` returns them, and of their curves.
+def results(runs, curves, betas):
+    """What `make_all` is to make of runs, as `select` returns them, and of their curves.
 
     All is of the first method that has runs, except where methods are compared (Sec. A7, A13).
     betas: those that have learning curves.
     """
-
-    def of(*names):  # runs of several methods
-        grids = [study.runs.main_grid(methods[name])[0] for name in names if name in methods]
-        return averaged(pd.concat(grids))
-
-    runs = next(filter(len, methods.values()))
-    grid, _ = study.runs.main_grid(runs)
+    of_all, grids = runs, averaged(study.runs.main_grid(runs))
+    four = grids.n_envs == 4
+    first = next(name for name in [*METHODS, *runs.method] if name in set(runs.method))
+    runs = runs[runs.method == first]
+    grid = study.runs.main_grid(runs)
     colored, every, main = grid[~grid.vanilla], averaged(runs), claims.of_most(averaged(grid))
     white = grid[((grid.beta == 0) | grid.vanilla) & ~grid.env_id.isin(COMPLEX)]
     white = white.assign(algorithm=np.where(white.vanilla, "vanilla PPO", r"$\beta = 0$"))
@@ -596,10 +594,10 @@ def results(methods, curves, betas):
         "n_envs_vs_n_steps": (compare, half, "update_size", ["environment"], "n_steps"),
         # Sec. A12: the preferred beta for each n_epochs, of the betas that have all of these
         "n_epochs_vs_beta": (compare, epochs[counts == counts.max()], "beta", CELL, "n_epochs"),
-        "transfer": (transfer, of("ppo", "trpo", "a2c").query("n_envs == 4")),
+        "transfer": (transfer, grids[grids.method.isin(["ppo", "trpo", "a2c"]) & four]),
         "complex_tasks": (complex_tasks, colored),
-        "gsde_vs_beta": (gsde_vs_beta, of("ppo", "gsde")),
-        "coverage": (claims.coverage, methods, curves),
+        "gsde_vs_beta": (gsde_vs_beta, grids[grids.method.isin(["ppo", "gsde"])]),
+        "coverage": (claims.coverage, of_all, curves),
         "claims": (verdicts, "coverage"),
         "beside_published": (beside_published, "average_final_returns", main),
     }
@@ -616,9 +614,9 @@ def results(methods, curves, betas):
 def draw_results(args):
     """The command `results`: makes all that the runs allow; says what is left out, and why."""
     runs, curves = study.runs.load(args.paths, args.env, args.beta, args.n_envs)
-    methods, left_out = study.runs.select_methods(runs)
+    runs, left_out = study.runs.select(runs)
     asked = [float(beta) for beta in args.beta or [] if beta != "vanilla"]
-    made, not_made = make_all(results(methods, curves, asked or [0, 0.5, 1]), args.out)
+    made, not_made = make_all(results(runs, curves, asked or [0, 0.5, 1]), args.out)
     for title, lines in {"runs left out": left_out, "not made": not_made}.items():
         print("\n  ".join([f"{title}: {len(lines)}", *lines]))
     print(f"{args.out}: {', '.join(made)}")

@@ -24,14 +24,10 @@ from scipy import stats
 
 import plot
 from study import claims, questions
-from study.runs import CELL, Unusable, differences, load, main_grid, published, select_methods
-from study.statistics import (
-    contrast,
-    interval,
-    mean_interval,
-    pooled_variances,
-    standardize,
-)
+from study.claims import HALF_OVER_WHITE
+from study.questions import complete, difference_text, mean_text
+from study.runs import CELL, Unusable, differences, load, main_grid, published, select
+from study.statistics import contrast, interval, interval_text, pooled_variances, standardize
 from study.tables import final_return_per_beta, final_returns, markdown
 
 RESULTS = Path(__file__).parent
@@ -55,9 +51,9 @@ BETAS = [0, 0.5, 1]
 
 @functools.cache
 def study_runs():
-    """The runs of FILES by method, and their curves."""
+    """The runs of FILES, and their curves."""
     runs, curves = load([RESULTS / file for file in FILES])
-    return select_methods(runs)[0], curves
+    return select(runs)[0], curves
 
 
 @functools.cache
@@ -67,7 +63,8 @@ def coverage():
 
 def main_runs():
     """Those of PPO with colored noise that are averaged in the figures."""
-    return claims.of_most(plot.averaged(main_grid(study_runs()[0]["ppo"])[0]))
+    runs, _ = study_runs()
+    return claims.of_most(plot.averaged(main_grid(runs[runs.method == "ppo"])))
 
 
 def colored(n_envs):
@@ -77,13 +74,6 @@ def colored(n_envs):
     seeds = runs.groupby(["environment", "n_envs", "beta"]).size()
     n_cells = (seeds > 1).groupby("environment").sum()
     return runs[runs.environment.map(n_cells) == len(n_envs) * len(BETAS)]
-
-
-@functools.cache
-def complete(*files):
-    """All complete runs of these files, whatever their settings."""
-    runs, _ = load([RESULTS / file for file in files])
-    return runs[runs.status == "complete"]
 
 
 def spread(values):
@@ -100,7 +90,7 @@ def runs():
     others = {file.name for file in RESULTS.glob("*.csv")} - {*FILES[:3], "speed.csv"}
     rows = []
     for files in (*([file] for file in FILES[:3]), sorted(others)):
-        made, one = complete(*files), len(files) == 1
+        (made, _), one = complete(*files), len(files) == 1
         seeds = made.groupby(["env_id", "beta", "n_envs"]).seed.nunique()
         row = {"file": f"`{files[0]}`" if one else "others: [notes](notes.md)"}
         row |= {"complete runs": f"{len(made)}", "environments": f"{made.env_id.nunique()}"}
@@ -143,7 +133,7 @@ def ahead():
 
 def goals():
     """How many runs of Mountain Car end at the goal, which gives 100 where all else costs."""
-    made = complete("reproduction.csv", "study.csv", "new_seeds.csv")
+    made, _ = complete("reproduction.csv", "study.csv", "new_seeds.csv")
     made = made[(made.environment == "Mountain Car") & made.beta.isin(["0", "0.5", "1"])]
     parts = []
     for n_envs in (1, 4, 32):
@@ -153,9 +143,6 @@ def goals():
     return f"Runs that end at its goal, β = 0.5 or 1 against white: {', '.join(parts)}.\n"
 
 
-HALF_OVER_WHITE = {"weights": {0.5: 1, 0: -1}, "by": "beta"}
-
-
 def our_lead(n_envs, but=()):
     """Our runs with these n_envs, the lead of 0.5 over white noise in them, and it as text.
 
@@ -163,9 +150,8 @@ def our_lead(n_envs, but=()):
     """
     part, cells = colored(n_envs), CELL[: len(n_envs)]
     part, of = part[~part.environment.isin(but)], 16 - len(but)
-    found = contrast(part.assign(z=standardize(part)), **HALF_OVER_WHITE, cells=cells, of=of)
-    low, high = interval(found)
-    return part, found, f"{found['mean']:z.2f} [{low:z.2f}, {high:z.2f}]"
+    found = contrast(part.assign(z=standardize(part)), HALF_OVER_WHITE, "beta", cells, of)
+    return part, found, interval_text(found["mean"], *interval(found))
 
 
 def published_cells():
@@ -186,7 +172,7 @@ def lead():
         theirs = theirs.assign(z=standardize(theirs))
         same = theirs[theirs.environment.isin(part.environment)]
         for name, cells in (("the same environments", same), ("all 16", theirs)):
-            paper_lead = contrast(cells, **HALF_OVER_WHITE, cells=CELL[: len(n_envs)])
+            paper_lead = contrast(cells, HALF_OVER_WHITE, "beta", CELL[: len(n_envs)])
             row[f"paper, {name}"] = f"{paper_lead['mean']:z.2f}"
         rows.append(row)
     return markdown(rows)
@@ -240,7 +226,7 @@ def settings():
     """New seeds beside the published means, and what a setting changes in the final return."""
     paper, rows = published("final_return_per_beta").set_index([*CELL, "beta"]), []
     for file in ("new_seeds.csv", "noise_length.csv"):
-        made = complete(file)
+        made, _ = complete(file)
         made = made.assign(flag=differences(made, ["batch_size", "noise_seq_len"]))
         for (environment, n_envs, beta), cell in made.groupby([*CELL, "beta"]):
             usual = cell.final_return[cell.flag == ""]
@@ -248,19 +234,11 @@ def settings():
                 if len(values) > 1:
                     row = {"environment": environment, "n_envs": f"{n_envs:g}", "β": beta}
                     row |= {"setting": f"`{flag}`" if flag else "the paper's"}
-                    mean, low, high = mean_interval(values)
-                    row |= {"runs": f"{len(values)}"}
-                    row["final return"] = f"{mean:z.0f} [{low:z.0f}, {high:z.0f}]"
-                    change = questions.difference_text(values, usual) if flag else ""
-                    row["less the paper's setting"] = change
+                    row |= {"runs": f"{len(values)}", "final return": mean_text(values)}
+                    row["less the paper's setting"] = difference_text(values, usual) if flag else ""
                     final = paper.final_return_mean[environment, int(n_envs), beta]
                     rows.append(row | {"published": f"{final:z.0f}"})
     return markdown(rows)
-
-
-def planned():
-    """The answers to the questions of plans.md."""
-    return questions.answers()
 
 
 def gymnasium():
@@ -286,7 +264,7 @@ def friction():
     """How many runs of the point with white noise, n_envs 4, end at the goal (it gives 1)."""
     rows = []
     for name, file in (("with friction", "point_with_friction.csv"), ("without", "study.csv")):
-        made, row = complete(file).query("method == 'ppo' and beta == '0' and n_envs == 4"), {}
+        made, row = complete(file)[0].query("method == 'ppo' and beta == '0' and n_envs == 4"), {}
         for env_id in ("PointUMaze-v1", "Point4Rooms-v1"):
             runs = made[(made.env_id == env_id) & (made.batch_size == 128)]
             row[runs.environment.iloc[0]] = f"{(runs.final_return > 0.5).sum()} of {len(runs)}"
@@ -314,50 +292,27 @@ def waiting():
 
 def costs():
     """Median minutes of a run in each environment, and core-hours of the whole study."""
-    made = complete("study.csv", "study_n_envs.csv")
+    made, _ = complete("study.csv", "study_n_envs.csv")
     minutes = made.groupby("environment").wall_seconds.median() / 60
     each = ", ".join(f"{name} {time:.0f}" for name, time in minutes.sort_values().items())
     hours = claims.rounded(20480 * minutes.mean() / 60)
     return f"Median minutes of a run: {each}. All 20,480: {hours} core-hours.\n"
 
 
-TABLES = [
-    runs,
-    ahead,
-    goals,
-    leads,
-    share,
-    counts,
-    lead,
-    final_returns_of_four,
-    offset,
-    speed,
-    waiting,
-    costs,
-    verdicts,
-    planned,
-    undecided,
-    settings,
-    friction,
-    gymnasium,
-]
-TABLES = {make.__name__: make for make in TABLES}
+TABLES = [runs, ahead, goals, leads, share, counts, lead, final_returns_of_four, offset, speed]
+TABLES += [waiting, costs, verdicts, undecided, settings, friction, gymnasium]
+TABLES = {make.__name__: make for make in TABLES} | {"planned": questions.answers}
 
 
 # --- Output ---------------------------------------------------------------------------------------
-
-
-def filled(text):
-    """The text with its tables made from the data."""
-    return MARKED.sub(lambda match: match[1] + TABLES[match[2]]() + match[3], text)
 
 
 def draw(folder):
     """Draws all figures to a folder; returns their paths."""
     todo = plot.results(*study_runs(), BETAS)
     if "gymnasium" in FIGURES:
-        runs, curves = load([GYMNASIUM])
-        runs = runs[runs.status == "complete"].astype({"beta": float})
+        runs, curves = complete(GYMNASIUM.name)
+        runs = runs.astype({"beta": float})
         runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
         todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
     tables = {todo[name][1] for name in FIGURES if isinstance(todo[name][1], str)}
@@ -378,8 +333,12 @@ def same_picture(a, b):
 
 
 def pages_that_differ():
-    """{path: text as it should be} of these."""
-    pages = {path: filled(path.read_text()) for path in PAGES}
+    """{path: text with its tables made from the data} of the pages that are otherwise."""
+
+    def made(match):
+        return match[1] + TABLES[match[2]]() + match[3]
+
+    pages = {path: MARKED.sub(made, path.read_text()) for path in PAGES}
     return {path: text for path, text in pages.items() if text != path.read_text()}
 
 

@@ -26,7 +26,7 @@ from scipy import stats
 
 from study.protocol import BETAS, COMPLEX, N_ENVS, NAMES, SETTINGS
 from study.runs import AXES, CELL, SHARED, Unusable, differences, main_grid, published, value_text
-from study.statistics import contrast, interval, less_published, standardize
+from study.statistics import contrast, interval, interval_text, less_published, standardize
 from study.tables import best_beta_per_env, final_returns, on_published_scale, projected_ranks
 
 # Chance that the 95 % BCa interval of so many seeds misses the mean of 20 others, as the published
@@ -41,7 +41,8 @@ OVER = ["environment", "beta"]  # cells of averages over the betas
 # and A10 took their form: the others decide
 SEEN = ["4 Rooms Point", "Cartpole Balance", "Cartpole Swingup", "Cheetah Run", "Hopper Hop"]
 SEEN += ["Mountain Car", "Pendulum Swingup", "Reacher Hard", "UMaze Point"]
-LEAD = {"what": "lead of 0.5 over 0", "weights": {0.5: 1, 0.0: -1}, "by": "beta"}
+HALF_OVER_WHITE = {0.5: 1, 0.0: -1}
+LEAD = {"what": "lead of 0.5 over 0", "weights": HALF_OVER_WHITE, "by": "beta"}
 
 
 # --- Beside the published means -------------------------------------------------------------------
@@ -73,8 +74,7 @@ def offset(runs):
     if cells["size"].max() < 2:
         return ["ours less the published: no cell with two seeds"]
     found = less_published(cells)
-    low, high = interval(found)
-    line = f"ours less the published {found['mean']:z.2f} [{low:z.2f}, {high:z.2f}] on average "
+    line = f"ours less the published {interval_text(found['mean'], *interval(found))} on average "
     line += f"over {len(cells)} cells, where the paper's lowest is 0 and its highest 1"
     tasks = (cells["mean"] - cells.paper).groupby("environment").agg(["mean", "size"])
     tasks = tasks.sort_values("mean")
@@ -105,9 +105,8 @@ class Finding:
 
 
 def words(what, found, alpha=0.05):
-    low, high = interval(found, alpha)
-    text = f"{what} {found['mean']:z.2f}"
-    text += ", no interval" if np.isnan(low) else f" [{low:z.2f}, {high:z.2f}]"
+    text = f"{what} {interval_text(found['mean'], *interval(found, alpha))}"
+    text = text.replace(" [nan, nan]", ", no interval")
     level = f", {100 * (1 - alpha):.3g} % interval" * (alpha != 0.05)
     return f"{text} ({found['made_of']}{': too few' if found['lacks'] else ''}{level})"
 
@@ -143,7 +142,7 @@ def between(runs, what, weights, by, cells=("environment",), least=0.0, most=np.
     """Finding on "the contrast is between least and most"; without these: it is positive."""
     found = contrast(runs, weights, by, cells, **how)
     if not found["environments"]:
-        missing = [value for value in weights if value not in set(runs[by])]
+        missing = [value for value in weights if value not in runs.groupby(by).groups]
         return lacking(by, missing) if missing else lacking(by, weights, "together")
     return finding(found, what, least, most)
 
@@ -157,8 +156,9 @@ def finding(found, what, least=0.0, most=np.inf):
 
 
 def lacking(what, values=(), how=""):
-    named = f"{what} {', '.join(map(value_text, values))} {how}".strip()
-    named = f"{len(values)} more combinations" if what == "cell" else named
+    named = f"{len(values)} more combinations"
+    if isinstance(what, str):
+        named = f"{what} {', '.join(map(value_text, values))} {how}".strip()
     return Finding("open", "no runs that can be compared", decides=f"runs with {named}")
 
 
@@ -193,7 +193,8 @@ def best(runs, winner, rivals, by, **more):
         return lacking(by, [winner, *rivals])
     second = min(leads, key=lambda rival: leads[rival]["mean"])
     there = f" (of {len(leads)} of {len(rivals)} rivals)" * bool(missing)
-    what = f"lead of {value_text(winner)} over the next, {value_text(second)}{there}:"
+    one, other = (", ".join(map(value_text, np.ravel(value))) for value in (winner, second))
+    what = f"lead of {one} over the next, {other}{there}:"
     shown, verdict = finding(leads[second], what), "open"
     enough = [found for found in leads.values() if not found["lacks"]]
     if any(interval(found, 0.05 / len(leads))[1] < 0 for found in enough):
@@ -202,23 +203,14 @@ def best(runs, winner, rivals, by, **more):
         verdict = "holds"
     decides = shown.decides or deciding(leads[second])
     if missing:
-        decides = f"runs with the other {len(missing)} {'combinations' if by == 'cell' else by}"
+        of = by if isinstance(by, str) else "combinations"
+        decides = f"runs with the other {len(missing)} {of}"
     return dataclasses.replace(shown, verdict=verdict, decides=decides * (verdict == "open"))
 
 
-def named(runs, *columns):
-    """The runs with `cell`, text of the values of these columns, such as "0.5, 4"."""
-    texts = [runs[column].map(value_text) for column in columns]
-    return runs.assign(cell=[", ".join(each) for each in zip(*texts, strict=True)])
-
-
 def crossed(rows, columns):
-    """Weights of cells named "row, column": the product of a row's weight and a column's."""
-    return {
-        f"{value_text(a)}, {value_text(b)}": x * y
-        for a, x in rows.items()
-        for b, y in columns.items()
-    }
+    """{(row, column): weight}, the products of the weights of rows and of columns."""
+    return {(a, b): x * y for a, x in rows.items() for b, y in columns.items()}
 
 
 def slope(values):
@@ -240,8 +232,7 @@ def two_and_four_best(runs):
 
 
 def best_configuration(runs):
-    cells = [f"{beta:g}, {n}" for beta in BETAS for n in N_ENVS]
-    return best(named(runs, "beta", "n_envs"), "0.5, 4", cells, "cell")
+    return best(runs, (0.5, 4), list(itertools.product(BETAS, N_ENVS)), ["beta", "n_envs"])
 
 
 def color_matters(runs):
@@ -328,11 +319,11 @@ def grid(runs):
 
 def larger_n_envs_larger_beta(runs):
     """The slope of performance over beta has a positive slope over log2 n_envs."""
-    return unseen(runs, "gain per beta and doubling", interaction)
 
+    def weights(betas, n_envs):
+        return crossed(slope(betas), slope_per_doubling(n_envs))
 
-def interaction(betas, n_envs):
-    return crossed(slope(betas), slope_per_doubling(n_envs))
+    return unseen(runs, "gain per beta and doubling", weights)
 
 
 def ranks_as_projected(runs):
@@ -349,8 +340,7 @@ def projected(betas, n_envs):
     paper = published("best_beta_per_n_envs").set_index("n_envs").best_beta
     ranks = -projected_ranks(paper, betas, n_envs)  # 1, the best, becomes the highest
     ranks = ranks.sub(ranks.mean(1), axis=0).sub(ranks.mean(0), axis=1) + ranks.to_numpy().mean()
-    weights = (ranks / (ranks**2).to_numpy().sum()).stack()
-    return {f"{value_text(b)}, {value_text(n)}": weight for (b, n), weight in weights.items()}
+    return (ranks / (ranks**2).to_numpy().sum()).stack().to_dict()
 
 
 def unseen(runs, what, weights_of):
@@ -358,10 +348,9 @@ def unseen(runs, what, weights_of):
     betas, n_envs = grid(runs)
     if min(len(betas), len(n_envs)) < 3:
         return lacking("three betas at each of three n_envs")
-    runs, weights = named(runs, "beta", "n_envs"), weights_of(betas, n_envs)
-    before = runs.environment.isin(SEEN)
-    found = between(runs[~before], what, weights, "cell", of=16 - len(SEEN))
-    seen = contrast(runs[before], weights, "cell", of=len(SEEN))
+    weights, by, before = weights_of(betas, n_envs), ["beta", "n_envs"], runs.environment.isin(SEEN)
+    found = between(runs[~before], what, weights, by, of=16 - len(SEEN))
+    seen = contrast(runs[before], weights, by, of=len(SEEN))
     if not seen["environments"]:
         return found
     data = f"{found.data}; {words('seen before the test was chosen:', seen)}"
@@ -392,8 +381,7 @@ def less_in_a2c(runs):
     """Each method's performance is standardized by itself."""
     z = pd.concat([standardize(group) for _, group in runs.groupby("method")])
     weights = crossed({"trpo": 1, "a2c": -1}, {0.5: 1, 0: -1})
-    what = "lead in TRPO less that in A2C"
-    return between(named(runs.assign(z=z), "method", "beta"), what, weights, "cell")
+    return between(runs.assign(z=z), "lead in TRPO less that in A2C", weights, ["method", "beta"])
 
 
 def a2c_learns_less(runs):
@@ -447,7 +435,7 @@ def same_preference(runs):
     """The lead of 0.5 over the mean of 0.2 and 0.75 is the same with 5 and 20 epochs as with 10."""
     lead = {0.5: 1, 0.2: -0.5, 0.75: -0.5}
     weights = [crossed(lead, {other: 1, 10: -1}) for other in (5, 20)]
-    return same(named(runs, "beta", "n_epochs"), weights, "cell")
+    return same(runs, weights, ["beta", "n_epochs"])
 
 
 def published_final_returns(runs):
@@ -461,18 +449,16 @@ def published_final_returns(runs):
 # --- The table ------------------------------------------------------------------------------------
 
 
-def usable_runs(methods, curves):
-    """All methods' runs with the study's settings on its tasks: one table.
+def usable_runs(runs, curves):
+    """Those with the study's settings on its tasks; of PPO with any n_steps and n_epochs.
 
-    methods, curves: of `select_methods` and `load`. Adds `noise`, text of beta or "gsde"; and
-    `first`, `top` and `last` of `no_collapse`.
+    runs, curves: of `select` and `load`. Adds `noise`, text of beta or "gsde"; and `first`, `top`
+    and `last` of `no_collapse`.
     """
-    kept = []
-    for name, runs in methods.items():
-        own = SHARED if name in ("trpo", "a2c") else {*SETTINGS} - {"method", "n_steps", "n_epochs"}
-        runs = runs if name == "ppo" else main_grid(runs)[0]
-        kept.append(runs[(differences(runs, own) == "") & runs.env_id.isin(list(NAMES))])
-    runs = pd.concat(kept)
+    runs = runs[(runs.method == "ppo") | runs.index.isin(main_grid(runs).index)]
+    differ = differences(runs, {*SETTINGS} - {"method", "n_steps", "n_epochs"})
+    differ = differ.where(~runs.method.isin(["trpo", "a2c"]), differences(runs, SHARED))
+    runs = runs[(differ == "") & runs.env_id.isin(list(NAMES))]
     returns = curves.loc[runs.index].dropna(axis=1, how="all")
     returns = returns.T.rolling(max(1, returns.shape[1] // 10)).mean().dropna().T
     if returns.shape[1]:
@@ -487,13 +473,13 @@ def of_most(runs, of=16):
     return runs[there >= min(of / 2, there.max())] if len(runs) else runs
 
 
-def claim_runs(methods, curves):
-    """The runs that each claim is about: {name: (runs, how many the paper has)}.
+def claim_runs(runs, curves):
+    """The runs that each claim is about: {name: (runs, how many the paper has, their presets)}.
 
     Of `usable_runs`, with `z`, standardized performance: within each environment, over the runs of
     that name.
     """
-    runs = usable_runs(methods, curves)
+    runs = usable_runs(runs, curves)
     hard, four = runs.env_id.isin(COMPLEX), runs.n_envs == 4
     ppo = (runs.method == "ppo") & runs.n_envs.isin(N_ENVS)
     usual = ppo & (runs.n_steps == 2048) & (runs.n_epochs == 10)
@@ -502,130 +488,125 @@ def claim_runs(methods, curves):
     three = main & runs.beta.isin([0, 0.5, 1]) & runs.n_envs.isin([1, 4, 32])
     trpo, a2c = ((runs.method == name) & four & colors & ~hard for name in ("trpo", "a2c"))
     few = runs.beta.isin([0.2, 0.5, 0.75]) & runs.n_epochs.isin([5, 10, 20])
+    gsde = (runs.method == "gsde") & runs.n_envs.isin(N_ENVS) & ~hard
     size = ppo & colors & (runs.beta == 0.5) & (runs.n_epochs == 10) & runs.n_envs.isin([2, 4, 8])
     chosen = {
-        "main": (main, 20480),
-        "all": (usual & ~hard & (colors | runs.vanilla), 23040),
-        "vanilla": (white, 5120),
-        "car": (white & (runs.environment == "Mountain Car"), 320),
-        "trpo": (trpo, 2560),
-        "a2c": (a2c, 2560),
-        "both": (trpo | a2c, 5120),
-        "methods": (trpo | a2c | main & four, 7680),
-        "complex": (usual & colors & hard & four, 640),
-        "n_envs 4": (main & four, 2560),
-        "pendulum": (three & (runs.environment == "Pendulum Swingup"), 180),
-        "three": (three, 2880),
-        "n_steps": (size & ~hard & (runs.n_envs * runs.n_steps == 8192), 960),
-        "n_epochs": (ppo & colors & few & ~hard & four & (runs.n_steps == 2048), 2880),
-        "gsde": (main | (runs.method == "gsde") & runs.n_envs.isin(N_ENVS) & ~hard, 23040),
+        "main": (main, 20480, "main"),
+        "all": (usual & ~hard & (colors | runs.vanilla), 23040, "main, vanilla"),
+        "vanilla": (white, 5120, "main, vanilla"),
+        "car": (white & (runs.environment == "Mountain Car"), 320, "main, vanilla"),
+        "trpo": (trpo, 2560, "transfer"),
+        "a2c": (a2c, 2560, "transfer"),
+        "both": (trpo | a2c, 5120, "transfer"),
+        "methods": (trpo | a2c | main & four, 7680, "main, transfer"),
+        "complex": (usual & colors & hard & four, 640, "complex"),
+        "n_envs 4": (main & four, 2560, "main"),
+        "pendulum": (three & (runs.environment == "Pendulum Swingup"), 180, "main"),
+        "three": (three, 2880, "main"),
+        "n_steps": (size & ~hard & (runs.n_envs * runs.n_steps == 8192), 960, "main, n_steps"),
+        "n_epochs": (ppo & colors & few & ~hard & four & (runs.n_steps == 2048), 2880, "n_epochs"),
+        "gsde": (main | gsde, 23040, "main, gsde"),
     }
-    parts = {name: (runs[mask], total) for name, (mask, total) in chosen.items()}
-    for name in ("main", "n_envs 4"):
-        parts[name] = of_most(parts[name][0]), parts[name][1]
-    return {name: (part.assign(z=standardize(part)), n) for name, (part, n) in parts.items()}
+    parts = {}
+    for name, (mask, total, presets) in chosen.items():
+        part = of_most(runs[mask]) if name in ("main", "n_envs 4") else runs[mask]
+        parts[name] = part.assign(z=standardize(part)), total, presets
+    return parts
 
 
 # fmt: off
-CLAIMS = [  # where, what it shows or says, preset, file, name of its runs, test
-    ("Fig. 1", "random walks", "noise", "noise_random_walks", None, None),
-    ("Sec. Colored Noise", "expected PSD", "noise", "noise_psd", None, None),
-    ("Fig. 2", "the environments", "environments", "results/environments.png", None, None),
+CLAIMS = [  # where, what it shows or says, name of its runs or command, file, test
+    ("Fig. 1", "random walks", "noise", "noise_random_walks", None),
+    ("Sec. Colored Noise", "expected PSD", "noise", "noise_psd", None),
+    ("Fig. 2", "the environments", "environments", "results/environments.png", None),
     ("Introduction", "colored noise does better than white in most environments", "main",
-     "best_beta_per_env", "main", ahead_in_most),
-    ("Fig. 3", "the color of the noise affects performance", "main", "performance_vs_beta", "main",
+     "best_beta_per_env", ahead_in_most),
+    ("Fig. 3", "the color of the noise affects performance", "main", "performance_vs_beta",
      color_matters),
-    ("Fig. 3", "beta 0.5 outperforms white noise", "main", "performance_vs_beta", "main",
+    ("Fig. 3", "beta 0.5 outperforms white noise", "main", "performance_vs_beta",
      partial(between, **LEAD, cells=CELL)),
-    ("Fig. 3, conclusion i", "beta 0.5 is best on average", "main", "performance_vs_beta", "main",
+    ("Fig. 3, conclusion i", "beta 0.5 is best on average", "main", "performance_vs_beta",
      partial(best, winner=0.5, rivals=BETAS, by="beta", cells=CELL)),
-    ("Table 1", "the best beta depends on the environment", "main", "best_beta_per_env", "main",
+    ("Table 1", "the best beta depends on the environment", "main", "best_beta_per_env",
      best_beta_varies),
-    ("Table 1, conclusion ii", "0.5, 0, 1 comparable with the best in 11, 8, 7 of 16: in most for "
-     "0.5", "main", "best_beta_per_env", "main", comparable_counts),
+    ("Table 1, conclusion ii",
+     "0.5, 0, 1 comparable with the best in 11, 8, 7 of 16: in most for 0.5", "main",
+     "best_beta_per_env", comparable_counts),
     ("Fig. 4, conclusion iii", "n_envs 4 is best on average", "main", "performance_vs_n_envs",
-     "main", partial(best, winner=4, rivals=N_ENVS, by="n_envs", cells=OVER)),
+     partial(best, winner=4, rivals=N_ENVS, by="n_envs", cells=OVER)),
     ("Conclusion iii", "n_envs 2 and 4 outperform all others", "main", "performance_vs_n_envs",
-     "main", two_and_four_best),
-    ("Fig. 4", "more environments than 4 do worse", "main", "performance_vs_n_envs", "main",
+     two_and_four_best),
+    ("Fig. 4", "more environments than 4 do worse", "main", "performance_vs_n_envs",
      more_n_envs_worse),
     ("Fig. 5, conclusion iv", "larger n_envs wants larger beta", "main", "n_envs_beta_grids",
-     "main", larger_n_envs_larger_beta),
+     larger_n_envs_larger_beta),
     ("Fig. 5", "beta 0.5 with n_envs 4 is the best configuration", "main", "n_envs_beta_grids",
-     "main", best_configuration),
-    ("Fig. 6", "a sequence's mean spreads more with larger beta", "noise", "noise_bias", None,
-     None),
+     best_configuration),
+    ("Fig. 6", "a sequence's mean spreads more with larger beta", "noise", "noise_bias", None),
     ("Fig. 7, conclusion v", "ranks follow those projected from the bias", "main",
-     "n_envs_beta_grids", "main", ranks_as_projected),
+     "n_envs_beta_grids", ranks_as_projected),
     ("Fig. A1", "subsequent steps are correlated where beta > 0, more with larger beta", "noise",
-     "noise_two_step", None, None),
-    ("Fig. A1", "each step is Gaussian", "noise", "noise_marginal", None, None),
-    ("Table A2", "best beta per n_envs", "main", "best_beta_per_n_envs", "main", None),
-    ("Fig. A6", "beta 0 matches vanilla PPO", "main, vanilla", "beta0_vs_vanilla", "vanilla",
+     "noise_two_step", None),
+    ("Fig. A1", "each step is Gaussian", "noise", "noise_marginal", None),
+    ("Table A2", "best beta per n_envs", "main", "best_beta_per_n_envs", None),
+    ("Fig. A6", "beta 0 matches vanilla PPO", "vanilla", "beta0_vs_vanilla",
      partial(same, weights=[{True: 1, False: -1}], by="vanilla", cells=CELL)),
-    ("Fig. A7a", "beta 0.5 improves TRPO", "transfer", "transfer", "trpo",
-     partial(between, **LEAD)),
-    ("Fig. A7b", "beta 0.5 improves A2C", "transfer", "transfer", "a2c",
-     partial(between, **LEAD)),
-    ("Fig. A7", "the effect is less in A2C", "transfer", "transfer", "both", less_in_a2c),
-    ("Fig. A7c", "A2C learns less than PPO and TRPO", "main, transfer", "transfer", "methods",
-     a2c_learns_less),
-    ("Fig. A8", "beta 0.5 is favored in complex tasks", "complex", "complex_tasks", "complex",
+    ("Fig. A7a", "beta 0.5 improves TRPO", "trpo", "transfer", partial(between, **LEAD)),
+    ("Fig. A7b", "beta 0.5 improves A2C", "a2c", "transfer", partial(between, **LEAD)),
+    ("Fig. A7", "the effect is less in A2C", "both", "transfer", less_in_a2c),
+    ("Fig. A7c", "A2C learns less than PPO and TRPO", "methods", "transfer", a2c_learns_less),
+    ("Fig. A8", "beta 0.5 is favored in complex tasks", "complex", "complex_tasks",
      partial(best, winner=0.5, rivals=BETAS, by="beta", of=4)),
     ("Table A9", "final return and performance, mean and maximum", "main",
-     "final_return_and_performance", "main", None),
-    ("Sec. A10", "learning Mountain Car requires correlated noise", "main, vanilla",
-     "learning_curves_mountain_car", "car", hardly_found),
-    ("Sec. A10", "policies do not collapse", "main", "learning_curves_n_envs_4", "n_envs 4",
-     no_collapse),
-    ("Sec. A10", "Pendulum Swingup: beta 0, 0.5, 1 best with n_envs 1, 4, 32", "main",
-     "learning_curves_pendulum_swingup", "pendulum", pendulum),
-    ("Sec. A10", "learning curves, beta 0, 0.5 and 1, n_envs 1, 4 and 32", "main",
-     "learning_curves_n_envs_*", "three", None),
-    ("Sec. A10", "beta 1 gains with larger n_envs", "main", "learning_curves_n_envs_*", "three",
+     "final_return_and_performance", None),
+    ("Sec. A10", "learning Mountain Car requires correlated noise", "car",
+     "learning_curves_mountain_car", hardly_found),
+    ("Sec. A10", "policies do not collapse", "n_envs 4", "learning_curves_n_envs_4", no_collapse),
+    ("Sec. A10", "Pendulum Swingup: beta 0, 0.5, 1 best with n_envs 1, 4, 32", "pendulum",
+     "learning_curves_pendulum_swingup", pendulum),
+    ("Sec. A10", "learning curves, beta 0, 0.5 and 1, n_envs 1, 4 and 32", "three",
+     "learning_curves_n_envs_*", None),
+    ("Sec. A10", "beta 1 gains with larger n_envs", "three", "learning_curves_n_envs_*",
      pink_gains_with_n_envs),
-    ("Fig. A11", "n_envs and n_steps do not matter if their product stays", "main, n_steps",
-     "n_envs_vs_n_steps", "n_steps", partial(same, by="n_steps", weights=[
+    ("Fig. A11", "n_envs and n_steps do not matter if their product stays", "n_steps",
+     "n_envs_vs_n_steps", partial(same, by="n_steps", weights=[
          {4096: 1, 2048: -1}, {1024: 1, 2048: -1}, {4096: 1, 1024: -1}])),
-    ("Fig. A12", "half the epochs do worse", "n_epochs", "n_epochs_vs_beta", "n_epochs",
+    ("Fig. A12", "half the epochs do worse", "n_epochs", "n_epochs_vs_beta",
      partial(between, what="10 epochs over 5", weights={10: 1, 5: -1}, by="n_epochs", cells=OVER)),
     ("Fig. A12", "the preference for 0.5 is the same with 5, 10 and 20 epochs", "n_epochs",
-     "n_epochs_vs_beta", "n_epochs", same_preference),
-    ("Fig. A13", "gSDE is like beta 1.25 to 2", "main, gsde", "gsde_vs_beta", "gsde",
+     "n_epochs_vs_beta", same_preference),
+    ("Fig. A13", "gSDE is like beta 1.25 to 2", "gsde", "gsde_vs_beta",
      partial(same, weights=[{"gsde": 1, "1.25": -0.5, "2": -0.5}], by="noise", cells=CELL)),
-    ("Table A14", "final returns", "main, vanilla", "final_return_per_beta", "all",
-     published_final_returns),
+    ("Table A14", "final returns", "all", "final_return_per_beta", published_final_returns),
 ]
 # fmt: on
 
 
-def coverage(methods, curves):
+def coverage(runs, curves):
     """Every figure, table and claim of the paper: what makes it, how much is here, what that says.
 
-    methods, curves: of `select_methods` and `load`. Returns a DataFrame with a row per claim of
-    CLAIMS: what `Finding` has, blank without a test; `runs`, how many there are, with 20 seeds a
-    cell at most; the command and the file that show it.
+    runs, curves: of `select` and `load`. Returns a DataFrame with a row per claim of CLAIMS: what
+    `Finding` has, blank without a test; `runs`, how many there are, with 20 seeds a cell at most;
+    the command and the file that show it.
     """
-    parts, table = claim_runs(methods, curves), []
-    for where, says, presets, file, name, test in CLAIMS:
-        runs, total = parts.get(name, (None, 0))
-        found = dataclasses.asdict(tested(test, runs))
-        command, count = f"python plot.py {presets}", "none needed"
-        if name:
+    parts, table = claim_runs(runs, curves), []
+    for where, says, name, file, test in CLAIMS:
+        found, command, count = Finding("", ""), f"python plot.py {name}", "none needed"
+        if name in parts:
+            runs, total, presets = parts[name]
+            found = tested(test, runs) if test else found
             cell = ["method", *AXES[:-1]]
             here = runs.groupby(cell, dropna=False).seed.nunique().clip(upper=20).sum()
             count = f"{here} of {total}"
             sweeps = [f"./run_sweep.sh {preset}" for preset in presets.split(", ")]
             command = "; ".join([*sweeps, "python plot.py results runs/"])
-        row = {"where": where, "says": says, **found, "runs": count}
+        row = {"where": where, "says": says, **dataclasses.asdict(found), "runs": count}
         table.append(row | {"command": command, "file": file})
     return pd.DataFrame(table)
 
 
 def tested(test, runs):
-    """The Finding of a claim's test, blank without one."""
-    if test is None:
-        return Finding("", "")
+    """The Finding of a claim's test."""
     if runs.empty:
         return Finding("open", "no runs", decides="runs")
     try:

@@ -2,10 +2,11 @@
 
     python -m study.questions
 
-prints them as Markdown tables, from the packed runs in results/. A question whose runs are not
-there yet is passed over.
+prints them as Markdown tables, from the packed runs in results/, those on Gymnasium once its runs
+are there.
 """
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy import stats
 
 from study.protocol import GYMNASIUM
 from study.runs import load, published
-from study.statistics import interval, less_published, mean_interval
+from study.statistics import interval, interval_text, less_published, mean_interval
 from study.tables import markdown
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -22,17 +23,17 @@ STEPS = [204_800 * i for i in range(1, 11)]  # of the ten evaluations that all o
 PENDULUM, CAR = "dm_control/pendulum-swingup-v0", "MountainCarContinuous-v0"
 
 
-def complete(env_id, *names):
-    """The complete runs of an environment in these files of results/, each seed once.
+@functools.cache
+def complete(*files):
+    """All complete runs in these files of results/, whatever their settings, and their curves."""
+    runs, curves = load([RESULTS / file for file in files])
+    return runs[runs.status == "complete"], curves[runs.status == "complete"]
 
-    `performance` is the mean over the evaluations at STEPS.
-    """
-    files = [RESULTS / f"{name}.csv" for name in names if (RESULTS / f"{name}.csv").exists()]
-    if not files:
-        return pd.DataFrame()
-    runs, curves = load(files)
-    runs = runs[(runs.status == "complete") & (runs.env_id == env_id)]
-    runs = runs[runs.total_timesteps == STEPS[-1]]
+
+def long_runs(env_id, *files):
+    """Those of an environment, of all steps; `performance` is that of the evaluations at STEPS."""
+    runs, curves = complete(*files)
+    runs = runs[(runs.env_id == env_id) & (runs.total_timesteps == STEPS[-1])]
     return runs.assign(performance=curves.loc[runs.index, STEPS].mean(axis=1, skipna=False))
 
 
@@ -44,54 +45,49 @@ def as_in_the_paper(runs):
 
 
 def mean_text(values):
-    mean, low, high = mean_interval(values)
-    return f"{mean:.0f} [{low:.0f}, {high:.0f}]"
+    return interval_text(*mean_interval(values), digits=0)
 
 
 def difference_text(a, b):
     """Mean of a less that of b with Welch's interval, and p of Mann and Whitney's test."""
-    low, high = stats.ttest_ind(a, b, equal_var=False).confidence_interval()
+    ends = stats.ttest_ind(a, b, equal_var=False).confidence_interval()
     p = stats.mannwhitneyu(a, b).pvalue
-    return f"{np.mean(a) - np.mean(b):.0f} [{low:.0f}, {high:.0f}], p = {p:.2g}"
+    return f"{interval_text(np.mean(a) - np.mean(b), *ends, digits=0)}, p = {p:.2g}"
 
 
 def stable_baselines3():
     """Pendulum Swingup, white noise, n_envs 1: Stable-Baselines3 (SB3) beside this script."""
-    theirs = complete(PENDULUM, "sb3")
-    if len(theirs) < 2:
-        return None
-    ours = as_in_the_paper(complete(PENDULUM, "new_seeds")).query("n_envs == 1 and beta == '0'")
-    rows = []
-    for column, paper in (("final_return", "714.5"), ("performance", "")):
-        row = {
+    theirs, ours = long_runs(PENDULUM, "sb3.csv"), long_runs(PENDULUM, "new_seeds.csv")
+    ours = as_in_the_paper(ours).query("n_envs == 1 and beta == '0'")
+    rows = [
+        {
             "": column.replace("_", " "),
             f"this script, {len(ours)} runs": mean_text(ours[column]),
+            f"SB3, {len(theirs)} runs": mean_text(theirs[column]),
+            "SB3 less this script": difference_text(theirs[column], ours[column]),
+            "published": paper,
         }
-        row[f"SB3, {len(theirs)} runs"] = mean_text(theirs[column])
-        row["SB3 less this script"] = difference_text(theirs[column], ours[column])
-        rows.append(row | {"published": paper})
+        for column, paper in (("final_return", "714.5"), ("performance", ""))
+    ]
     return pd.DataFrame(rows)
 
 
 def pendulum_order():
     """Pendulum Swingup, n_envs 1: performance by beta. In the paper 0 is best."""
-    runs = as_in_the_paper(complete(PENDULUM, "new_seeds", "study"))
-    runs = runs.query("n_envs == 1 and seed > 100")
-    groups = [runs[runs.beta == beta].performance for beta in ("0", "0.5", "1")]
-    if min(map(len, groups)) < 2:
-        return None
-    rows = []
-    for beta, values in zip((0, 0.5, 1), groups, strict=True):
-        row = {"beta": f"{beta:g}", "runs": f"{len(values)}", "performance": mean_text(values)}
-        row["beta 0 less this"] = difference_text(groups[0], values) if beta else ""
+    runs = as_in_the_paper(long_runs(PENDULUM, "new_seeds.csv", "study.csv"))
+    runs = runs.query("n_envs == 1 and seed > 100 and beta in ['0', '0.5', '1']")
+    white, rows = runs[runs.beta == "0"].performance, []
+    for beta, values in runs.groupby("beta").performance:
+        row = {"beta": beta, "runs": f"{len(values)}", "performance": mean_text(values)}
+        row["beta 0 less this"] = "" if beta == "0" else difference_text(white, values)
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def pendulum_beside_published():
     """Pendulum Swingup, n_envs 4: final returns of all runs, and how far off on average."""
-    runs = complete(PENDULUM, "reproduction", "study", "noise_length", "new_seeds")
-    runs = as_in_the_paper(runs).query("n_envs == 4")
+    files = "reproduction.csv", "study.csv", "noise_length.csv", "new_seeds.csv"
+    runs = as_in_the_paper(long_runs(PENDULUM, *files)).query("n_envs == 4")
     paper = published("final_return_per_beta").set_index(["environment", "n_envs", "beta"])
     paper = paper.final_return_mean["Pendulum Swingup", 4]
     rows = []
@@ -103,36 +99,32 @@ def pendulum_beside_published():
         cells = part.groupby(["environment", "beta"]).final_return.agg(["mean", "var", "size"])
         cells["paper"] = paper[cells.index.get_level_values("beta")].to_numpy()
         found = less_published(cells)
-        low, high = interval(found)
         p = 2 * stats.t.sf(abs(found["mean"]) / found["se"], found["df"])
-        average = f"{found['mean']:.0f} [{low:.0f}, {high:.0f}], p = {p:.2g}"
+        average = f"{interval_text(found['mean'], *interval(found), digits=0)}, p = {p:.2g}"
         rows.append({"beta": name, "runs": f"{len(part)}", "ours less the published": average})
     return pd.DataFrame(rows).fillna("")
 
 
 def mountain_car():
     """Mountain Car, n_envs 4: runs that end at the goal; Fisher's test against the published."""
-    runs = as_in_the_paper(complete(CAR, "study")).query("n_envs == 4 and seed > 400")
-    released = complete(CAR, "released_code")
+    runs = as_in_the_paper(long_runs(CAR, "study.csv")).query("n_envs == 4 and seed > 400")
     cells = {
         "beta 0.2, batch size 128, T = 1000": (runs[runs.beta == "0.2"], 5),
-        "beta 0.2, batch size 64, T = 1024": (released, 5),
+        "beta 0.2, batch size 64, T = 1024": (long_runs(CAR, "released_code.csv"), 5),
         "beta 0, batch size 128, T = 1000": (runs[runs.beta == "0"], 0),
     }
     rows, counts = [], []
     for name, (cell, paper) in cells.items():
-        if len(cell):
-            count, n = int((cell.final_return > 0).sum()), len(cell)
-            counts.append([count, n - count])
-            low, high = stats.binomtest(count, n).proportion_ci()
-            row = {"": name, "end at the goal": f"{count} of {n}"}
-            row["share, 95 % interval"] = f"{low:.2f} to {high:.2f}"
-            p = stats.fisher_exact([counts[-1], [paper, 20 - paper]]).pvalue
-            rows.append(row | {"published": f"{paper} of 20", "p": f"{p:.2g}"})
-    if len(released) and len(counts) > 1:
-        p = stats.fisher_exact(counts[:2]).pvalue
-        rows.append({"": "the first two against each other", "p": f"{p:.2g}"})
-    return pd.DataFrame(rows).fillna("") if rows else None
+        count, n = int((cell.final_return > 0).sum()), len(cell)
+        counts.append([count, n - count])
+        low, high = stats.binomtest(count, n).proportion_ci()
+        row = {"": name, "end at the goal": f"{count} of {n}"}
+        row["share, 95 % interval"] = f"{low:.2f} to {high:.2f}"
+        p = stats.fisher_exact([counts[-1], [paper, 20 - paper]]).pvalue
+        rows.append(row | {"published": f"{paper} of 20", "p": f"{p:.2g}"})
+    p = stats.fisher_exact(counts[:2]).pvalue
+    rows.append({"": "the first two against each other", "p": f"{p:.2g}"})
+    return pd.DataFrame(rows).fillna("")
 
 
 def gymnasium_scores(last=5):
@@ -141,11 +133,9 @@ def gymnasium_scores(last=5):
     The mean of a run's last evaluations; of all twenty it is the area under the curve. Only tasks
     with all betas and n_envs, two seeds each.
     """
-    file = RESULTS / "gymnasium.csv"
-    if not file.exists():
+    if not (RESULTS / "gymnasium.csv").exists():
         return {}
-    runs, curves = load([file])
-    runs, curves = (table[runs.status == "complete"] for table in (runs, curves))
+    runs, curves = complete("gymnasium.csv")
     scores = curves.dropna(axis=1).iloc[:, -last:].mean(axis=1)
     cells = scores.groupby([runs.env_id, runs.n_envs, runs.beta]).apply(np.array)
     cells = cells[cells.map(len) > 1]
@@ -165,7 +155,7 @@ def lead(scores, task, n_envs, beta):
     return (ours.mean() - white.mean()) / std, 1 / len(ours) + 1 / len(white), df
 
 
-def interval_text(mean, se, df, level=0.95):
+def student_ends(mean, se, df, level=0.95):
     half = stats.t.ppf((1 + level) / 2, df) * se
     return f"{mean - half:z.2f} to {mean + half:z.2f}"
 
@@ -188,9 +178,9 @@ def gymnasium(last=5):
     for name, (leads, variances, df) in ((name, x.T) for name, x in columns.items()):
         n, mean = len(tasks), leads.mean()
         by_seeds = mean, variances.sum() ** 0.5 / n, df.sum()
-        ends = [interval_text(*by_seeds), interval_text(*by_seeds, 1 - 0.05 / 3), ""]
+        ends = [student_ends(*by_seeds), student_ends(*by_seeds, 1 - 0.05 / 3), ""]
         if n > 1:
-            ends[2] = interval_text(mean, leads.std(ddof=1) / n**0.5, n - 1)
+            ends[2] = student_ends(mean, leads.std(ddof=1) / n**0.5, n - 1)
         table[name] = [f"{x:z.2f}" for x in (*leads, mean)] + ends
     return table
 
@@ -208,7 +198,7 @@ QUESTIONS += [gymnasium_baseline]
 
 
 def answers():
-    """The answers that there are runs for, as Markdown."""
+    """The answers, as Markdown, those on Gymnasium once there are runs."""
     found = [(question.__doc__, question()) for question in QUESTIONS]
     parts = [f"{doc}\n\n{markdown(table)}" for doc, table in found if table is not None]
     return "\n".join(parts)

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from study.protocol import METHODS, NAMES, SETTINGS, bootstraps, ids_named
+from study.protocol import NAMES, SETTINGS, bootstraps, ids_named
 from study.status import run_folders
 
 # The study varies these. Runs that are equal in all of them are the same run.
@@ -182,57 +182,37 @@ def same_protocol(runs, arguments=SHARED):
     return runs
 
 
-def select(runs, method="ppo"):
-    """Chooses the runs of one method to average: complete, each setting and seed once.
+def select(runs):
+    """Chooses the runs to average: complete, each method, setting and seed once.
 
-    Returns them, with `beta` a number (NaN for vanilla PPO), and a line for each of its runs that
-    is left out. Raises Unusable where another argument than those that are listed at the top of
-    this file varies within an environment, or the same settings and seed are in two experiments:
-    of one of them the script may have been edited.
+    Returns them, with `beta` a number (NaN for vanilla PPO and gSDE), and a line for each run that
+    is left out. Raises Unusable where there is none; where another argument than those that are
+    listed at the top of this file varies within a method and environment; or where the same
+    settings and seed are in two experiments: of one of them the script may have been edited.
     """
-    runs = runs[runs.method == method]
-    status, complete = runs.status.copy(), runs[runs.status == "complete"]
-    same_protocol(complete, complete.columns.difference([*AXES, *EVALUATION, *UNIMPORTANT]))
-    same_protocol(complete[complete.duplicated(AXES, keep=False)], ["exp_name"])
-    per_dimension = complete.beta.str.contains("_")
-    status[complete.index[complete.duplicated(AXES)]] = "the same settings and seed as another run"
+    complete = runs[runs.status == "complete"]
+    for _, group in complete.groupby("method"):
+        same_protocol(group, group.columns.difference([*AXES, *EVALUATION, *UNIMPORTANT]))
+        same_protocol(group[group.duplicated(AXES, keep=False)], ["exp_name"])
+    again, per_dimension = complete.duplicated(["method", *AXES]), complete.beta.str.contains("_")
+    status = runs.status.copy()
+    status[complete.index[again]] = "the same settings and seed as another run"
     status[complete.index[per_dimension]] = "one beta per action dimension is not in the study"
     left_out = (runs.source + "/" + runs.path + ": " + status)[status != "complete"].tolist()
     chosen = runs[status == "complete"]
+    need(len(chosen), "; ".join(["a complete run", *left_out[:1]]))
     beta = pd.to_numeric(chosen.beta, errors="coerce").astype(float)
     return chosen.assign(beta=beta, vanilla=chosen.beta == "vanilla"), left_out
 
 
-def select_methods(runs, method="ppo"):
-    """`select` for each method, `method` first: they are compared, but never averaged.
-
-    Returns a dict, method: its runs, the first `method` even if it has none, then those that have
-    any; and the lines of all. Raises Unusable where no method has any.
-    """
-    chosen, left_out = {}, []
-    for name in dict.fromkeys([method, *METHODS, *runs.method]):
-        part, lines = select(runs, name)
-        left_out += lines
-        if len(part) or name == method:
-            chosen[name] = part
-    need(any(map(len, chosen.values())), "; ".join(["a complete run", *left_out[:1]]))
-    return chosen, left_out
-
-
 def main_grid(runs):
-    """The runs with the study's n_steps and n_epochs, 2048 and 10, or else the most frequent ones.
-
-    Returns them, and a line for each environment that has no such runs.
-    """
-    settings = pd.Series(list(zip(runs.n_steps, runs.n_epochs, strict=True)), runs.index, object)
-    usual = (SETTINGS["n_steps"], SETTINGS["n_epochs"])
-    setting = usual if usual in set(settings) or runs.empty else settings.mode()[0]
-    dropped = [
-        f"{environment}: n_steps and n_epochs {sorted(set(group))}, not {setting}"
-        for environment, group in settings.groupby(runs.environment)
-        if setting not in set(group)
-    ]
-    return runs[settings == setting], dropped
+    """The runs with the study's n_steps and n_epochs, or else their method's most frequent ones."""
+    settings = runs.n_steps.map("{:g}, ".format) + runs.n_epochs.map("{:g}".format)
+    usual = "{n_steps:g}, {n_epochs:g}".format(**SETTINGS)
+    chosen = settings.groupby(runs.method).transform(
+        lambda group: usual if usual in set(group) else group.mode()[0]
+    )
+    return runs[settings == chosen]
 
 
 def comparable(runs, axes, cells):

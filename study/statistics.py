@@ -189,8 +189,8 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
     with f = E / of the variance is (1 - f) s^2 / E between environments + f / E times the mean
     variance by seeds. So 16 of 16 are the study itself, where only seeds are chance.
 
-    weights: {value of the column `by`: weight}. cells: columns, `environment` first, and at most
-    one more.
+    weights: {value: weight} of a column `by`, {(value, ...): weight} of a list of columns. cells:
+    columns, `environment` first, and at most one more.
 
     Returns a dict: environments, and where there are any: mean; se, NaN where all groups have one
     seed; df; by_seeds, the error that is left with all `of` environments; runs; made_of, in words;
@@ -198,7 +198,7 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
     second column of cells, if any.
     """
     weight = pd.Series(weights, dtype=float)
-    groups = runs[runs[by].isin(list(weights))].groupby([*cells, by]).z
+    groups = runs.groupby([*cells, *([by] if isinstance(by, str) else by)]).z
     if groups.ngroups == 0:
         return {"environments": 0}
     tables = groups.mean(), groups.var().fillna(0), groups.size()
@@ -237,3 +237,7 @@ def interval(found, alpha=0.05):
     """Low and high end of the 1 - alpha interval of a `contrast`; NaN where it has none."""
     half = stats.t.ppf(1 - alpha / 2, found["df"]) * found["se"] if found["se"] else 0.0
     return found["mean"] - half, found["mean"] + half
+
+
+def interval_text(mean, low, high, digits=2):
+    return "{:z.{d}f} [{:z.{d}f}, {:z.{d}f}]".format(mean, low, high, d=digits)

@@ -107,8 +107,7 @@ def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path):
             pictures[path.stem] = bytes(fig.canvas.buffer_rgba())
 
     monkeypatch.setattr(plt.Figure, "savefig", save)
-    methods = dict(list(runs.groupby("method", sort=False)))
-    todo = plot.results(methods, made_up_curves(runs), [0, 0.5, 1])
+    todo = plot.results(runs, made_up_curves(runs), [0, 0.5, 1])
     known = {*todo, *plot.noise([]), "", "learning_curves_n_envs_*", "results/environments.png"}
     # The table of the paper's claims names figures and tables that are made
     assert {claim[3] for claim in claims.CLAIMS} <= known
@@ -129,7 +128,7 @@ def test_every_figure_and_table_of_the_study(monkeypatch, tmp_path):
 def test_what_cannot_be_made_has_a_reason(monkeypatch, tmp_path):
     monkeypatch.setattr(plt.Figure, "savefig", lambda *_, **__: None)
     runs = made_up(level, [CAR], [0.5], seeds=1)
-    todo = plot.results({"ppo": runs}, made_up_curves(runs), [0.5])
+    todo = plot.results(runs, made_up_curves(runs), [0.5])
     del todo["coverage"]
     made, not_made = plot.make_all(todo, tmp_path)
     reasons = dict(line.split(": needs ") for line in not_made)
@@ -157,7 +156,7 @@ def test_averages_are_of_comparable_cells_and_say_of_which():
     assert ax.get_title() == "n_envs 4, 32 in 1 environment; 30 runs"
     # A beta that only one of them has changes no average
     more = together(runs, made_up(level, [CAR], [0.2]))
-    data = plot.results({"ppo": more}, made_up_curves(more), [])["performance_vs_beta"][1]
+    data = plot.results(more, made_up_curves(more), [])["performance_vs_beta"][1]
     assert set(data.beta) == {0, 0.5, 1} and set(data.environment) == set(runs.environment)
 
 
@@ -184,7 +183,7 @@ def test_a_line_per_algorithm_n_steps_and_n_epochs():
         ("n_envs_vs_n_steps", steps, 0.2, "n_steps", "update_size"),
         ("n_epochs_vs_beta", epochs, 2, "n_epochs", "beta"),
     ):
-        make, *arguments = plot.results({"ppo": runs}, made_up_curves(runs), [])[name]
+        make, *arguments = plot.results(runs, made_up_curves(runs), [])[name]
         check_lines(make(*arguments), runs[runs.beta != left_out], by, x)
 
 

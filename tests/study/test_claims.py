@@ -24,8 +24,7 @@ def coverage(monkeypatch):
         assert len(claims.CLAIMS) == len(says)
         runs = pd.concat(methods.values(), ignore_index=True)
         curves = pd.DataFrame({10: 0.0, 20: runs.final_return, 30: runs.final_return}, runs.index)
-        methods = {name: runs[runs.method == name] for name in methods}
-        return claims.coverage(methods, curves).set_index("says")
+        return claims.coverage(runs, curves).set_index("says")
 
     return table
 
@@ -40,7 +39,7 @@ def test_every_claim_has_a_row():
     """Whatever the runs."""
     axes = {"method": [], "environment": [], "beta": 0.0, "n_envs": 0, "n_steps": 0, "n_epochs": 0}
     runs = pd.DataFrame({**axes, "seed": 0, "vanilla": False, "env_id": [], "performance": 0.0})
-    table = claims.coverage({"ppo": runs}, pd.DataFrame()).set_index("says")
+    table = claims.coverage(runs, pd.DataFrame()).set_index("says")
     assert len(table) == len(claims.CLAIMS) == 36
     assert (table.verdict == "open").sum() == 27 == (table.data == "no runs").sum()
     assert table.runs["final returns"] == "0 of 23040"
@@ -287,7 +286,7 @@ def test_policies_that_collapse_are_counted(made_up):
     for runs, share, verdict in ((every, 0, "holds"), (few, 0, "open"), (few, 0.5, "does not")):
         curves = pd.DataFrame({10: 0.0, 20: 5.0, 30: 5.0}, runs.index)
         curves.loc[runs.seed < 5 * share, 30] = 1.0
-        parts = claims.claim_runs({"ppo": runs}, curves)
+        parts = claims.claim_runs(runs, curves)
         assert claims.no_collapse(parts["n_envs 4"][0]).verdict == verdict
 
 

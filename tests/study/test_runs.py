@@ -161,29 +161,33 @@ def test_other_methods_are_selected_apart(tmp_path, write_run):
             write_run(tmp_path, CAR, 0.5, 4, seed, [5.0, 6.0], method=name, exp_name=name)
     unfinished = write_run(tmp_path, CAR, 0.5, 4, 3, [1.0], method="a2c", exp_name="a2c")
     (unfinished / "summary.json").unlink()
-    methods, left_out = runs.select_methods(load([tmp_path], beta=["0.5"])[0])
-    counts = {name: len(table) for name, table in methods.items()}
+    chosen, left_out = select(load([tmp_path], beta=["0.5"])[0])
+    counts = chosen.method.value_counts().to_dict()
     assert counts == dict.fromkeys(["ppo", "trpo", "gsde", "my_own"], 2)
-    assert methods["gsde"].beta.isna().all() and not methods["gsde"].vanilla.any()
+    gsde = chosen[chosen.method == "gsde"]
+    assert gsde.beta.isna().all() and not gsde.vanilla.any()
     assert len(left_out) == 1 and "unfinished" in left_out[0]
-    alone, _ = runs.select_methods(load([tmp_path / "trpo"])[0])
-    assert [*alone] == ["ppo", "trpo"] and alone["ppo"].empty
-    assert next(iter(runs.select_methods(load([tmp_path])[0], "trpo")[0])) == "trpo"
+    assert set(select(load([tmp_path / "trpo"])[0])[0].method) == {"trpo"}
     with pytest.raises(Unusable, match="unfinished"):
-        runs.select_methods(load([tmp_path / "a2c"])[0])
-    both = pd.concat([methods["ppo"], methods["trpo"]])
+        select(load([tmp_path / "a2c"])[0])
+    both = chosen[chosen.method.isin(["ppo", "trpo"])]
     runs.same_protocol(both.assign(learning_rate=np.where(both.method == "trpo", 1e-3, 2.5e-4)))
     with pytest.raises(Unusable, match="gamma 0.9"):
         runs.same_protocol(both.assign(gamma=np.where(both.method == "trpo", 0.9, 0.99)))
 
 
-def test_main_grid_names_the_environments_that_it_drops(tmp_path, write_run, selected):
+def test_main_grid(tmp_path, write_run, selected):
+    """The study's settings, or else the most frequent ones, of each method."""
     write_run(tmp_path, CAR, 0.5, 4, 1, [1.0])
-    write_run(tmp_path, PENDULUM, 0.5, 2, 1, [1.0], n_steps=4096)
-    grid, dropped = runs.main_grid(selected(tmp_path))
+    for seed, n_steps in enumerate([4096, 4096, 512]):
+        write_run(tmp_path, PENDULUM, 0.5, 2, seed, [1.0], n_steps=n_steps)
+    every = selected(tmp_path)
+    grid = runs.main_grid(every)
     assert grid.env_id.tolist() == [CAR]
-    assert dropped == ["Pendulum Swingup: n_steps and n_epochs [(4096, 10)], not (2048, 10)"]
-    assert runs.main_grid(grid[:0])[0].empty
+    assert runs.main_grid(every[every.env_id == PENDULUM]).n_steps.tolist() == [4096, 4096]
+    others = every.assign(method="a2c")[every.env_id == PENDULUM]
+    assert len(runs.main_grid(pd.concat([every, others], ignore_index=True))) == 1 + 2
+    assert runs.main_grid(grid[:0]).empty
 
 
 def test_only_cells_that_have_all_values_are_comparable(made_up):
