@@ -61,26 +61,17 @@ SETTINGS = {
 
 # Gymnasium's MuJoCo tasks with the settings that are usual there (results/plans.md): CleanRL's with
 # one environment, and many environments with short rollouts, as on GPUs
-GYMNASIUM = [
-    f"{name}-v5" for name in ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Swimmer", "Humanoid")
-]
-GYMNASIUM_FLAGS = ["--total-timesteps", "1000000", "--eval-freq", "50000", "--eval-episodes", "10"]
-GYMNASIUM_FLAGS += ["--learning-rate", "3e-4", "--anneal-lr", "--normalize-obs"]
-GYMNASIUM_FLAGS += ["--normalize-rewards"]
-GYMNASIUM_SIZES = {  # n_envs: flags
-    1: ["--n-steps", "2048", "--batch-size", "64"],
-    32: ["--n-steps", "128", "--batch-size", "512"],
+GYMNASIUM = ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "Humanoid-v5"]
+usual = "--total-timesteps 1000000 --eval-freq 50000 --eval-episodes 10 --learning-rate 3e-4 "
+usual += "--anneal-lr --normalize-obs --normalize-rewards"
+GYMNASIUM_FLAGS = {  # by n_envs
+    1: f"{usual} --n-steps 2048 --batch-size 64".split(),
+    32: f"{usual} --n-steps 128 --batch-size 512".split(),
 }
 
 # What run_sweep.sh varies: the values of each axis that a preset does not give otherwise
-GRID = {
-    "seeds": SEEDS,
-    "envs": MAIN,
-    "n_envs": [4],
-    "betas": BETAS,
-    "n_epochs": [10],
-    "methods": ["ppo"],
-}
+GRID = {"seeds": SEEDS, "envs": MAIN, "n_envs": [4], "betas": BETAS}
+GRID |= {"n_epochs": [10], "methods": ["ppo"]}
 PRESETS = {
     "quick": {"envs": ["MountainCarContinuous-v0"], "betas": [0, 0.5], "seeds": [1, 2]},
     "main": {"n_envs": N_ENVS},
@@ -89,12 +80,7 @@ PRESETS = {
     "n_epochs": {"n_epochs": [5, 10, 20], "betas": [0.2, 0.5, 0.75]},
     "complex": {"envs": COMPLEX},
     "transfer": {"methods": ["trpo", "a2c"]},
-    "gymnasium": {
-        "envs": GYMNASIUM,
-        "betas": [0, 0.5, 1],
-        "n_envs": list(GYMNASIUM_SIZES),
-        "seeds": list(range(1, 9)),
-    },
+    "gymnasium": {"envs": GYMNASIUM, "betas": [0, 0.5, 1], "n_envs": [1, 32], "seeds": SEEDS[:8]},
     "gsde": {"n_envs": N_ENVS, "betas": ["gsde"], "methods": ["gsde"]},
 }
 

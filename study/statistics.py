@@ -61,10 +61,9 @@ def mean_intervals(runs, column, by):
     groups = runs.groupby(by)[column]
     rows = [[*mean_interval(values), len(values)] for _, values in groups]
     table = pd.DataFrame(rows, groups.mean().index, columns=["mean", "low", "high", "runs"])
-    scatter = pd.DataFrame({"df": groups.size() - 1, "squares": groups.var().fillna(0)})
-    scatter["squares"] *= scatter.df
-    pooled = scatter.groupby("environment").transform("sum").replace({"df": {0: np.nan}})
-    half = stats.t.ppf(0.975, pooled.df) * (pooled.squares / pooled.df / table.runs) ** 0.5
+    variances, df = pooled_variances(groups.agg(["var", "size"]))
+    pooled = pd.DataFrame({"var": variances, "df": df}).reindex(table.index, level="environment")
+    half = stats.t.ppf(0.975, pooled.df) * (pooled["var"] / table.runs) ** 0.5
     few = table.runs < FEW
     table.loc[few, "low"], table.loc[few, "high"] = table["mean"] - half, table["mean"] + half
     return table
@@ -197,12 +196,12 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
     lacks, in words, "" where there is enough: half of the environments, and three values of the
     second column of cells, if any.
     """
-    weight = pd.Series(weights, dtype=float)
     groups = runs.groupby([*cells, *([by] if isinstance(by, str) else by)]).z
-    if groups.ngroups == 0:
-        return {"environments": 0}
     tables = groups.mean(), groups.var().fillna(0), groups.size()
-    tables = [table.unstack(by).reindex(columns=weight.index) for table in tables]
+    tables, weight = [table.unstack(by) for table in tables], pd.Series(weights, dtype=float)
+    if not weights.keys() <= set(tables[0]):
+        return {"environments": 0}
+    tables = [table[list(weights)] for table in tables]
     there, two = tables[2].notna().all(axis=1), (tables[2] > 1).all(axis=1)
     chosen, lacks, made_of = tables[2].index[two if two.any() else there], "", ""
     if len(cells) > 1:

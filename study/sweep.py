@@ -51,16 +51,7 @@ import sys
 import textwrap
 from pathlib import Path
 
-from study.protocol import (
-    GRID,
-    GYMNASIUM_FLAGS,
-    GYMNASIUM_SIZES,
-    NAMES,
-    PRESETS,
-    SETTINGS,
-    bootstraps,
-    ids_named,
-)
+from study.protocol import GRID, GYMNASIUM_FLAGS, NAMES, PRESETS, SETTINGS, bootstraps, ids_named
 from study.status import status
 
 ROOT = str(Path(__file__).resolve().parent.parent)
@@ -132,7 +123,7 @@ def parse_args(argv):
         parser.error(f"{flag} is set by the sweep and cannot follow --")
     for axis, values in (GRID | PRESETS[args.preset]).items():
         setattr(args, axis, getattr(args, axis, None) or values)
-    if args.preset == "gymnasium" and set(args.n_envs) - {*GYMNASIUM_SIZES}:
+    if args.preset == "gymnasium" and set(args.n_envs) - {*GYMNASIUM_FLAGS}:
         parser.error("gymnasium has --n-envs 1 and 32")
     return args
 
@@ -166,7 +157,7 @@ def run(args, seed, env_id, n_envs, beta, n_epochs, method):
         flags += ["--n-epochs", str(n_epochs)]
         name += f"_n_epochs_{n_epochs}"
     if args.preset == "gymnasium":
-        flags += GYMNASIUM_FLAGS + GYMNASIUM_SIZES[n_envs]
+        flags += GYMNASIUM_FLAGS[n_envs]
         name = args.exp_name or "gymnasium"
     flags += ["--n-envs", str(n_envs), "--seed", str(seed), "--exp-name", name]
     if not bootstraps(env_id):

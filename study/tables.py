@@ -9,16 +9,7 @@ import numpy as np
 import pandas as pd
 
 from colored_noise import mean_std
-from study.runs import (
-    CELL,
-    Unusable,
-    beside_paper,
-    beta_text,
-    comparable,
-    differences,
-    need,
-    published,
-)
+from study.runs import CELL, Unusable, beside_paper, comparable, differences, need, published
 from study.statistics import FEW, cells_intervals, mean_intervals, standardize, welch
 
 
@@ -151,7 +142,7 @@ def final_returns(runs):
     `in_interval`: whether our interval holds the published mean, which is rounded to one decimal.
     """
     cell = [*CELL, "beta"]
-    runs = runs.assign(beta=runs.beta.map(beta_text))
+    runs = runs.assign(beta=runs.beta.map("{:g}".format).mask(runs.vanilla, "vanilla"))
     paper = published("final_return_per_beta").set_index(cell)[["final_return_mean"]]
     table = mean_intervals(runs, "final_return", cell)
     table = beside_paper(table, runs, paper.set_axis(["paper"], axis=1))
