@@ -10,10 +10,10 @@ Sections named below are those of Hollenstein, Martius, Piater: "Colored Noise i
 with its appendix.
 """
 
-import argparse
 import math
 import re
 import textwrap
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -27,16 +27,9 @@ from matplotlib.ticker import EngFormatter
 from scipy import stats
 from tqdm import tqdm
 
+import colored_noise
 import ppo_colored_continuous as ppo
 import study.runs
-from colored_noise import (
-    ColoredNoiseProcess,
-    autocovariance,
-    colored_noise,
-    expected_psd,
-    marginal_variance,
-    mean_std,
-)
 from study import claims, tables
 from study.environments import prepare_rendering
 from study.protocol import BETAS, COMPLEX, METHODS, NAMES, SETTINGS
@@ -150,9 +143,10 @@ def draw_grid(ax, sizes, title):
 # --- Figures of the noise -------------------------------------------------------------------------
 
 
-def draw_noise(beta, *size, seed=0):
+def draw_noise(beta, *size):
     """Sequences (*size, 1000), the paper's length, from the same random numbers for each beta."""
-    return colored_noise(beta, (*size, 1000), generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(0)
+    return colored_noise.colored_noise(beta, (*size, 1000), generator=generator)
 
 
 def random_walks(betas):
@@ -183,7 +177,7 @@ def power_spectral_density(betas):
     for beta in betas:
         psd = torch.fft.rfft(draw_noise(beta, 1000).double()).abs().square().mean(0)[1:]
         ax.loglog(f, psd, color=look(beta)["color"], lw=3, alpha=0.4)
-        ax.loglog(f, expected_psd(beta, 1000)[1:], color=look(beta)["color"], lw=1)
+        ax.loglog(f, colored_noise.expected_psd(beta, 1000)[1:], color=look(beta)["color"], lw=1)
         ax.plot(f[0], psd[0], **look(beta))
     entries = [("measured", {"lw": 3, "alpha": 0.4}), (r"closed form, $f^{-\beta}$", {"lw": 1})]
     legend_above(fig, *entries, betas=betas)
@@ -195,7 +189,7 @@ def two_step_scatter(betas):
     labels = r"$\varepsilon_t$", r"$\varepsilon_{t+1}$"
     fig, axes = panels(len(betas), *labels, width=2.2, height=2.2)
     for ax, beta in zip(axes, betas, strict=True):
-        noise, lags = draw_noise(beta, 2000).numpy(), autocovariance(beta, 1000)
+        noise, lags = draw_noise(beta, 2000).numpy(), colored_noise.autocovariance(beta, 1000)
         correlation = np.corrcoef(noise[:, :-1].ravel(), noise[:, 1:].ravel())[0, 1]
         ax.scatter(noise[:, 500], noise[:, 501], s=3, color=look(beta)["color"], alpha=0.5, lw=0)
         measured = f"correlation {correlation:z.2f}"
@@ -209,7 +203,7 @@ def marginal_distribution(betas):
     fig, axes = panels(len(betas), r"$\varepsilon_t$", "density")
     x, line = np.linspace(-4.5, 4.5, 91), {"color": "black", "lw": 0.9}
     for ax, beta in zip(axes, betas, strict=True):
-        noise, variance = draw_noise(beta, 5000), float(marginal_variance(beta, 1000))
+        noise, variance = draw_noise(beta, 5000), colored_noise.marginal_variance(beta, 1000).item()
         sample = noise[:, ::50].flatten().numpy()
         ax.hist(sample, bins=x, density=True, color=look(beta)["color"], alpha=0.6)
         ax.plot(x, stats.norm.pdf(x, scale=variance**0.5), **line)
@@ -228,7 +222,7 @@ def bias(betas):
             violin.set(facecolor=look(beta)["color"], alpha=0.8)
         right.plot(beta, means.std(), **look(beta), ls="", zorder=3)
     curve = np.linspace(min(betas) - 0.1, max(betas) + 0.1, 200)
-    right.plot(curve, mean_std(curve, 1000), color=INK, lw=1)
+    right.plot(curve, colored_noise.mean_std(curve, 1000), color=INK, lw=1)
     left.set_xticks(range(len(betas)), [f"{beta:g}" for beta in betas])
     left.set_ylabel("mean of a sequence of 1000 steps")
     right.set_ylabel("standard deviation of the mean")
@@ -343,8 +337,7 @@ def transfer(runs):
 def gsde_vs_beta(runs):
     """Sec. A13: gSDE, which has no beta, beside the betas of PPO with colored noise."""
     need(runs.method.nunique() > 1, "runs of gSDE and runs with colored noise")
-    shared = [argument for argument in SETTINGS if argument != "method"]
-    runs = same_protocol(runs, [*shared, "bootstrap_timeouts"])
+    runs = same_protocol(runs, [*SETTINGS.keys() - {"method"}, "bootstrap_timeouts"])
     right = runs.beta.max() + 0.5
     algorithm = runs.method.map({"ppo": "PPO with colored noise", "gsde": "gSDE"})
     runs = runs.assign(beta=runs.beta.fillna(right), algorithm=algorithm)
@@ -471,7 +464,8 @@ def untrained_positions(beta, n_cars=50, n_steps=999, seed=1):
     torch.manual_seed(seed)
     limit = ["--max-episode-steps", f"{n_steps + 1}", "--n-steps", f"{n_steps}", "--no-envpool"]
     args = ppo.parse_args(["--env-id", "MountainCarContinuous-v0", "--n-envs", f"{n_cars}", *limit])
-    envs, noise = ppo.make_vector_env(args, n_cars), ColoredNoiseProcess(beta, n_cars, 1, seed=seed)
+    envs = ppo.make_vector_env(args, n_cars)
+    noise = colored_noise.ColoredNoiseProcess(beta, n_cars, 1, seed=seed)
     act, there = ppo.exploration(ppo.Agent(2, 1), noise, args), np.zeros(n_cars, bool)
     obs, _ = envs.reset(seed=seed)
     positions = [obs[:, 0].copy()]  # the environments write into obs again
@@ -611,21 +605,8 @@ def results(runs, curves, betas):
     return todo
 
 
-def draw_results(args):
-    """The command `results`: makes all that the runs allow; says what is left out, and why."""
-    runs, curves = study.runs.load(args.paths, args.env, args.beta, args.n_envs)
-    runs, left_out = study.runs.select(runs)
-    asked = [float(beta) for beta in args.beta or [] if beta != "vanilla"]
-    made, not_made = make_all(results(runs, curves, asked or [0, 0.5, 1]), args.out)
-    for title, lines in {"runs left out": left_out, "not made": not_made}.items():
-        print("\n  ".join([f"{title}: {len(lines)}", *lines]))
-    print(f"{args.out}: {', '.join(made)}")
-
-
 def parse_args():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     add = parser.add_subparsers(dest="command", required=True).add_parser
     commands = {
         "noise": (add("noise", help="figures of the noise"), "figures"),
@@ -645,8 +626,14 @@ def parse_args():
 def main():
     args = parse_args()
     plt.switch_backend("Agg")  # figures are written to files, not shown
-    if args.command == "results":
-        draw_results(args)
+    if args.command == "results":  # all that the runs allow
+        runs, curves = study.runs.load(args.paths, args.env, args.beta, args.n_envs)
+        runs, left_out = study.runs.select(runs)
+        asked = [float(beta) for beta in args.beta or [] if beta != "vanilla"]
+        made, not_made = make_all(results(runs, curves, asked or [0, 0.5, 1]), args.out)
+        for title, lines in {"runs left out": left_out, "not made": not_made}.items():
+            print("\n  ".join([f"{title}: {len(lines)}", *lines]))
+        print(f"{args.out}: {', '.join(made)}")
     elif args.command == "noise":
         made, _ = make_all(noise(sorted(set(args.beta))), args.out)
         print(f"{args.out}: {', '.join(made)}")

@@ -8,12 +8,12 @@ of that name here. Two pictures are the same if no pixel differs by more than TO
 only rounding may differ, since requirements.txt pins matplotlib, which brings its own fonts.
 """
 
-import argparse
 import functools
 import re
 import shutil
 import sys
 import tempfile
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -25,12 +25,11 @@ from scipy import stats
 import plot
 from study import claims, questions
 from study.claims import HALF_OVER_WHITE
-from study.questions import complete, difference_text, mean_text
-from study.runs import CELL, Unusable, differences, load, main_grid, published, select
+from study.questions import RESULTS, complete, difference_text, mean_text
+from study.runs import CELL, Unusable, comparable, differences, load, main_grid, published, select
 from study.statistics import contrast, interval, interval_text, pooled_variances, standardize
 from study.tables import final_return_per_beta, final_returns, markdown
 
-RESULTS = Path(__file__).parent
 ROOT = RESULTS.parent
 PAGES = [ROOT / "README.md", ROOT / "docs/sweeps.md", RESULTS / "README.md", RESULTS / "notes.md"]
 FILES = ["reproduction.csv", "study.csv", "study_n_envs.csv", "slices.csv", "methods.csv"]
@@ -39,8 +38,7 @@ FIGURES = [  # names as in plot.py, of these files
     *("n_envs_vs_n_steps", "n_epochs_vs_beta", "complex_tasks", "transfer", "gsde_vs_beta"),
     *(f"learning_curves_n_envs_{n_envs}" for n_envs in (1, 4, 32)),
 ]
-GYMNASIUM = RESULTS / "gymnasium.csv"
-FIGURES += ["gymnasium"] * GYMNASIUM.exists()
+FIGURES += ["gymnasium"] * (RESULTS / "gymnasium.csv").exists()
 TOLERANCE = 32
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 BETAS = [0, 0.5, 1]
@@ -69,11 +67,8 @@ def main_runs():
 
 def colored(n_envs):
     """Main runs with these n_envs and BETAS, of environments with two seeds in all these cells."""
-    runs = main_runs()
-    runs = runs[runs.n_envs.isin(n_envs) & runs.beta.isin(BETAS)]
-    seeds = runs.groupby(["environment", "n_envs", "beta"]).size()
-    n_cells = (seeds > 1).groupby("environment").sum()
-    return runs[runs.environment.map(n_cells) == len(n_envs) * len(BETAS)]
+    runs = main_runs().query("n_envs in @n_envs and beta in @BETAS")
+    return comparable(runs, ["n_envs", "beta"], ["environment"])
 
 
 def spread(values):
@@ -109,7 +104,7 @@ def final_returns_of_four():
 def offset():
     """How far our final returns are from the published, and where most."""
     whole, tasks = claims.offset(main_runs())
-    first, second, *_, last = tasks.split(", ")
+    first, second, *_, last = tasks
     return f"{whole[0].upper()}{whole[1:]}. By task: from {first} and {second} to {last}.\n"
 
 
@@ -311,7 +306,7 @@ def draw(folder):
     """Draws all figures to a folder; returns their paths."""
     todo = plot.results(*study_runs(), BETAS)
     if "gymnasium" in FIGURES:
-        runs, curves = complete(GYMNASIUM.name)
+        runs, curves = complete("gymnasium.csv")
         runs = runs.astype({"beta": float})
         runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
         todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
@@ -343,9 +338,7 @@ def pages_that_differ():
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="only say what differs")
     args = parser.parse_args()
     plt.switch_backend("Agg")

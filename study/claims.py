@@ -42,6 +42,8 @@ OVER = ["environment", "beta"]  # cells of averages over the betas
 SEEN = ["4 Rooms Point", "Cartpole Balance", "Cartpole Swingup", "Cheetah Run", "Hopper Hop"]
 SEEN += ["Mountain Car", "Pendulum Swingup", "Reacher Hard", "UMaze Point"]
 HALF_OVER_WHITE = {0.5: 1, 0.0: -1}
+OVER_0_2_AND_0_75 = {0.5: 1, 0.2: -0.5, 0.75: -0.5}
+CONFIGURATIONS = list(itertools.product(BETAS, N_ENVS))
 LEAD = {"what": "lead of 0.5 over 0", "weights": HALF_OVER_WHITE, "by": "beta"}
 
 
@@ -65,21 +67,18 @@ def outside(table):
 
 
 def offset(runs):
-    """Lines that say how far our final returns are from the published means, and in what tasks.
+    """A line that says how far our final returns are from the published means, and one per task.
 
     On the scale of `on_published_scale`, as of `less_published`.
     """
     groups = on_published_scale(runs[~runs.vanilla]).groupby([*CELL, "beta"])
     cells = groups.final_return.agg(["mean", "var", "size"]).assign(paper=groups.paper.first())
-    if cells["size"].max() < 2:
-        return ["ours less the published: no cell with two seeds"]
     found = less_published(cells)
     line = f"ours less the published {interval_text(found['mean'], *interval(found))} on average "
     line += f"over {len(cells)} cells, where the paper's lowest is 0 and its highest 1"
     tasks = (cells["mean"] - cells.paper).groupby("environment").agg(["mean", "size"])
-    tasks = tasks.sort_values("mean")
-    each = [f"{name} {less:z.2f} ({n} cells)" for name, less, n in tasks.itertuples()]
-    return [line, ", ".join(each)]
+    tasks = tasks.sort_values("mean").itertuples()
+    return line, [f"{name} {less:z.2f} ({n} cells)" for name, less, n in tasks]
 
 
 # --- Verdicts -------------------------------------------------------------------------------------
@@ -90,7 +89,7 @@ class Finding:
     """What the runs say of a claim: a verdict, and in `data` the numbers behind it, in words.
 
     The claim is that a number is between least and most; low to high is its 95 % interval. They are
-    NaN where the claim is not about one number. `decides`: what would decide an open claim.
+    NaN where the claim is not about one number. `decides`: what would decide it if it is open.
     """
 
     verdict: str
@@ -102,6 +101,9 @@ class Finding:
     most: float = np.inf
     unit: str = "standard deviations"
     decides: str = ""
+
+    def __post_init__(self):
+        self.decides *= self.verdict == "open"
 
 
 def words(what, found, alpha=0.05):
@@ -141,7 +143,7 @@ def deciding(found, least=0.0, most=np.inf):
 def between(runs, what, weights, by, cells=("environment",), least=0.0, most=np.inf, **how):
     """Finding on "the contrast is between least and most"; without these: it is positive."""
     found = contrast(runs, weights, by, cells, **how)
-    if not found["environments"]:
+    if not found:
         missing = [value for value in weights if value not in runs.groupby(by).groups]
         return lacking(by, missing) if missing else lacking(by, weights, "together")
     return finding(found, what, least, most)
@@ -150,8 +152,7 @@ def between(runs, what, weights, by, cells=("environment",), least=0.0, most=np.
 def finding(found, what, least=0.0, most=np.inf):
     low, high = interval(found)
     verdict = "open" if found["lacks"] else judge(low, high, least, most)
-    decides = deciding(found, least, most) if verdict == "open" else ""
-    numbers = found["mean"], low, high, least, most
+    numbers, decides = (found["mean"], low, high, least, most), deciding(found, least, most)
     return Finding(verdict, words(what, found), *numbers, decides=decides)
 
 
@@ -170,14 +171,12 @@ def same(runs, weights, by, cells=("environment",)):
 def both(*findings):
     """All findings hold, or one does not, or it is open. The numbers are of the least certain."""
     verdicts = [each.verdict for each in findings]
-    verdict = "does not" if "does not" in verdicts else "holds"
-    if "open" in verdicts and verdict == "holds":
-        verdict = "open"
+    verdict = next(each for each in ("does not", "open", "holds") if each in verdicts)
     shown = [each for each in findings if each.verdict == verdict]
     shown = min(shown, key=lambda x: np.nan_to_num(min(x.low - x.least, x.most - x.high), nan=-9))
     data = "; ".join(dict.fromkeys(each.data for each in findings))
     decides = "; ".join(dict.fromkeys(filter(None, (each.decides for each in findings))))
-    return dataclasses.replace(shown, data=data, decides=decides * (verdict == "open"))
+    return dataclasses.replace(shown, data=data, decides=decides)
 
 
 def best(runs, winner, rivals, by, **more):
@@ -187,8 +186,8 @@ def best(runs, winner, rivals, by, **more):
     """
     rivals = [rival for rival in rivals if rival != winner]
     leads = {rival: contrast(runs, {winner: 1, rival: -1}, by, **more) for rival in rivals}
-    missing = [rival for rival in rivals if not leads[rival]["environments"]]
-    leads = {rival: found for rival, found in leads.items() if found["environments"]}
+    leads = {rival: found for rival, found in leads.items() if found}
+    missing = len(rivals) - len(leads)
     if not leads:
         return lacking(by, [winner, *rivals])
     second = min(leads, key=lambda rival: leads[rival]["mean"])
@@ -201,11 +200,9 @@ def best(runs, winner, rivals, by, **more):
         verdict = "does not"
     elif len(enough) == len(rivals) and all(interval(found)[0] > 0 for found in enough):
         verdict = "holds"
-    decides = shown.decides or deciding(leads[second])
-    if missing:
-        of = by if isinstance(by, str) else "combinations"
-        decides = f"runs with the other {len(missing)} {of}"
-    return dataclasses.replace(shown, verdict=verdict, decides=decides * (verdict == "open"))
+    of = by if isinstance(by, str) else "combinations"
+    decides = f"runs with the other {missing} {of}" if missing else deciding(leads[second])
+    return dataclasses.replace(shown, verdict=verdict, decides=decides)
 
 
 def crossed(rows, columns):
@@ -213,14 +210,10 @@ def crossed(rows, columns):
     return {(a, b): x * y for a, x in rows.items() for b, y in columns.items()}
 
 
-def slope(values):
-    """{value: weight} with which their results, summed, give the slope over these values."""
-    x = np.asarray(values, float) - np.mean(values)
+def slope(values, scale=np.asarray):
+    """{value: weight} with which their results, summed, give the slope over scale(values)."""
+    x = scale(values) - np.mean(scale(values))
     return dict(zip(values, x / (x**2).sum(), strict=True))
-
-
-def slope_per_doubling(n_envs):
-    return dict(zip(n_envs, slope(np.log2(n_envs)).values(), strict=True))
 
 
 # --- Tests: what is compared for each claim -------------------------------------------------------
@@ -231,10 +224,6 @@ def two_and_four_best(runs):
     return both(*(best(runs, n, rest, "n_envs", cells=OVER) for n in (2, 4)))
 
 
-def best_configuration(runs):
-    return best(runs, (0.5, 4), list(itertools.product(BETAS, N_ENVS)), ["beta", "n_envs"])
-
-
 def color_matters(runs):
     """Some beta does better than some other; the two furthest apart are shown.
 
@@ -242,7 +231,7 @@ def color_matters(runs):
     """
     pairs = itertools.permutations(sorted(runs.beta.unique()), 2)
     found = {pair: contrast(runs, {pair[0]: 1, pair[1]: -1}, "beta", CELL) for pair in pairs}
-    found = {pair: each for pair, each in found.items() if each["environments"]}
+    found = {pair: each for pair, each in found.items() if each}
     if not found:
         return lacking("beta", BETAS)
     enough = {pair: each for pair, each in found.items() if not each["lacks"]} or found
@@ -251,8 +240,7 @@ def color_matters(runs):
     low, high = interval(shown, alpha)
     verdict = "holds" if low > 0 and not shown["lacks"] else "open"
     text = words(f"{first:g} over {second:g}", shown, alpha)
-    decides = deciding(shown) if verdict == "open" else ""
-    return Finding(verdict, text, shown["mean"], low, high, decides=decides)
+    return Finding(verdict, text, shown["mean"], low, high, decides=deciding(shown))
 
 
 def ahead_in(runs, beta):
@@ -263,7 +251,7 @@ def ahead_in(runs, beta):
     """
     groups = runs.groupby("environment")
     found = {n: contrast(x, {beta: 1, 0.0: -1}, "beta", CELL, of=1) for n, x in groups}
-    found = {name: each for name, each in found.items() if each["environments"]}
+    found = {name: each for name, each in found.items() if each}
     alpha = 0.05 / max(len(found), 1)
     ends = {name: interval(each, alpha) for name, each in found.items()}
     ahead = [name for name, (low, _) in ends.items() if low > 0]
@@ -277,7 +265,7 @@ def best_beta_varies(runs):
     """In one environment pink noise does better than white, in another worse."""
     ahead, behind, _, text = ahead_in(runs, 1.0)
     decides = "an environment in which 1 is apart from 0 on the other side"
-    return Finding("holds", text) if ahead and behind else Finding("open", text, decides=decides)
+    return Finding("holds" if ahead and behind else "open", text, decides=decides)
 
 
 def ahead_in_most(runs):
@@ -310,33 +298,23 @@ def comparable_counts(runs):
     return Finding("holds" if half > max(8, white, pink) else "does not", text)
 
 
-def grid(runs):
-    """Betas and n_envs, lists, of which all combinations are there; n_envs with three betas."""
-    there = runs.groupby(["beta", "n_envs"]).size().unstack()
-    there = there.loc[:, there.count() > 2].dropna()
-    return there.index.tolist(), there.columns.tolist()
-
-
-def larger_n_envs_larger_beta(runs):
+def larger_n_envs_larger_beta(betas, n_envs):
     """The slope of performance over beta has a positive slope over log2 n_envs."""
-
-    def weights(betas, n_envs):
-        return crossed(slope(betas), slope_per_doubling(n_envs))
-
-    return unseen(runs, "gain per beta and doubling", weights)
+    return crossed(slope(betas), slope(n_envs, np.log2))
 
 
-def ranks_as_projected(runs):
+def pink_gains_with_n_envs(_, n_envs):
+    """Sec. A10: beta 1's lead over the mean of 0 and 0.5 has a positive slope over log2 n_envs."""
+    return crossed({0: -0.5, 0.5: -0.5, 1: 1.0}, slope(n_envs, np.log2))
+
+
+def ranks_as_projected(betas, n_envs):
     """Sec. "Why Do Larger beta Work Better": what is projected to be better is better.
 
     The slope of performance over the rank of a beta as it is projected for each n_envs from the
     published best betas. Means over betas and over n_envs are taken off: a beta that is good with
     any n_envs would be projected to be good, too, whatever the bias does.
     """
-    return unseen(runs, "gain per projected rank", projected)
-
-
-def projected(betas, n_envs):
     paper = published("best_beta_per_n_envs").set_index("n_envs").best_beta
     ranks = -projected_ranks(paper, betas, n_envs)  # 1, the best, becomes the highest
     ranks = ranks.sub(ranks.mean(1), axis=0).sub(ranks.mean(0), axis=1) + ranks.to_numpy().mean()
@@ -344,17 +322,22 @@ def projected(betas, n_envs):
 
 
 def unseen(runs, what, weights_of):
-    """Finding on "the contrast is positive", decided by environments that are not in SEEN."""
-    betas, n_envs = grid(runs)
+    """Finding on "the contrast is positive", decided by environments that are not in SEEN.
+
+    weights_of: one of the three functions above.
+    """
+    there = runs.groupby(["beta", "n_envs"]).size().unstack()
+    there = there.loc[:, there.count() > 2].dropna()  # of its rows and columns all combinations
+    betas, n_envs = there.index.tolist(), there.columns.tolist()
     if min(len(betas), len(n_envs)) < 3:
         return lacking("three betas at each of three n_envs")
     weights, by, before = weights_of(betas, n_envs), ["beta", "n_envs"], runs.environment.isin(SEEN)
     found = between(runs[~before], what, weights, by, of=16 - len(SEEN))
     seen = contrast(runs[before], weights, by, of=len(SEEN))
-    if not seen["environments"]:
+    if not seen:
         return found
     data = f"{found.data}; {words('seen before the test was chosen:', seen)}"
-    decides = found.decides and f"the other {16 - len(SEEN)} environments"
+    decides = f"the other {16 - len(SEEN)} environments"
     return dataclasses.replace(found, data=data, decides=decides)
 
 
@@ -363,18 +346,9 @@ def more_n_envs_worse(runs):
     n = sorted(n for n in runs.n_envs.unique() if n >= 4)
     if len(n) < 2:
         return lacking("n_envs 4 and more")
-    loss = {value: -weight for value, weight in slope_per_doubling(n).items()}
+    loss = {value: -weight for value, weight in slope(n, np.log2).items()}
     what = f"loss per doubling, n_envs {', '.join(map(str, n))}:"
     return between(runs, what, loss, "n_envs", OVER)
-
-
-def pink_gains_with_n_envs(runs):
-    """Sec. A10: beta 1's lead over the mean of 0 and 0.5 has a positive slope over log2 n_envs."""
-
-    def weights(_, n_envs):
-        return crossed({0: -0.5, 0.5: -0.5, 1: 1.0}, slope_per_doubling(n_envs))
-
-    return unseen(runs, "gain per doubling", weights)
 
 
 def less_in_a2c(runs):
@@ -401,7 +375,7 @@ def hardly_found(runs):
     while stats.binomtest(count, n + more).proportion_ci().high >= RARE:
         more += 1
     text = f"white noise ends at the goal in {count} of {n} runs, share {low:.2f} to {high:.2f}"
-    decides = f"{more} runs more, if none of them ends there" * (verdict == "open")
+    decides = f"{more} runs more, if none of them ends there"
     return Finding(verdict, text, count / n, low, high, -1, RARE, "share of runs", decides)
 
 
@@ -414,7 +388,7 @@ def no_collapse(runs):
     lost = runs["last"] < (runs["first"] + runs["top"]) / 2
     what = f"with n_envs 4 half lost by {lost.sum()} of {len(lost)} runs, share"
     found = contrast(runs.assign(z=lost.astype(float), every=1), {1: 1}, "every", OVER)
-    if not found["environments"]:
+    if not found:
         return lacking("n_envs 4")
     shown = dataclasses.replace(finding(found, what, -1, RARE), unit="share of runs")
     if shown.verdict == "holds" and set(runs.beta) != set(BETAS):
@@ -426,16 +400,9 @@ def pendulum(runs):
     found = []
     for n, beta in ((1, 0), (4, 0.5), (32, 1)):
         each = best(runs[runs.n_envs == n], beta, [0, 0.5, 1], "beta", of=1)
-        decides = f"n_envs {n}: {each.decides}" if each.decides else ""
-        found.append(dataclasses.replace(each, data=f"n_envs {n}: {each.data}", decides=decides))
+        texts = {"data": f"n_envs {n}: {each.data}", "decides": f"n_envs {n}: {each.decides}"}
+        found.append(dataclasses.replace(each, **texts))
     return both(*found)
-
-
-def same_preference(runs):
-    """The lead of 0.5 over the mean of 0.2 and 0.75 is the same with 5 and 20 epochs as with 10."""
-    lead = {0.5: 1, 0.2: -0.5, 0.75: -0.5}
-    weights = [crossed(lead, {other: 1, 10: -1}) for other in (5, 20)]
-    return same(runs, weights, ["beta", "n_epochs"])
 
 
 def published_final_returns(runs):
@@ -539,12 +506,13 @@ CLAIMS = [  # where, what it shows or says, name of its runs or command, file, t
     ("Fig. 4", "more environments than 4 do worse", "main", "performance_vs_n_envs",
      more_n_envs_worse),
     ("Fig. 5, conclusion iv", "larger n_envs wants larger beta", "main", "n_envs_beta_grids",
-     larger_n_envs_larger_beta),
+     partial(unseen, what="gain per beta and doubling", weights_of=larger_n_envs_larger_beta)),
     ("Fig. 5", "beta 0.5 with n_envs 4 is the best configuration", "main", "n_envs_beta_grids",
-     best_configuration),
+     partial(best, winner=(0.5, 4), rivals=CONFIGURATIONS, by=["beta", "n_envs"])),
     ("Fig. 6", "a sequence's mean spreads more with larger beta", "noise", "noise_bias", None),
     ("Fig. 7, conclusion v", "ranks follow those projected from the bias", "main",
-     "n_envs_beta_grids", ranks_as_projected),
+     "n_envs_beta_grids",
+     partial(unseen, what="gain per projected rank", weights_of=ranks_as_projected)),
     ("Fig. A1", "subsequent steps are correlated where beta > 0, more with larger beta", "noise",
      "noise_two_step", None),
     ("Fig. A1", "each step is Gaussian", "noise", "noise_marginal", None),
@@ -567,14 +535,15 @@ CLAIMS = [  # where, what it shows or says, name of its runs or command, file, t
     ("Sec. A10", "learning curves, beta 0, 0.5 and 1, n_envs 1, 4 and 32", "three",
      "learning_curves_n_envs_*", None),
     ("Sec. A10", "beta 1 gains with larger n_envs", "three", "learning_curves_n_envs_*",
-     pink_gains_with_n_envs),
+     partial(unseen, what="gain per doubling", weights_of=pink_gains_with_n_envs)),
     ("Fig. A11", "n_envs and n_steps do not matter if their product stays", "n_steps",
      "n_envs_vs_n_steps", partial(same, by="n_steps", weights=[
          {4096: 1, 2048: -1}, {1024: 1, 2048: -1}, {4096: 1, 1024: -1}])),
     ("Fig. A12", "half the epochs do worse", "n_epochs", "n_epochs_vs_beta",
      partial(between, what="10 epochs over 5", weights={10: 1, 5: -1}, by="n_epochs", cells=OVER)),
     ("Fig. A12", "the preference for 0.5 is the same with 5, 10 and 20 epochs", "n_epochs",
-     "n_epochs_vs_beta", same_preference),
+     "n_epochs_vs_beta", partial(same, by=["beta", "n_epochs"], weights=[
+         crossed(OVER_0_2_AND_0_75, {5: 1, 10: -1}), crossed(OVER_0_2_AND_0_75, {20: 1, 10: -1})])),
     ("Fig. A13", "gSDE is like beta 1.25 to 2", "gsde", "gsde_vs_beta",
      partial(same, weights=[{"gsde": 1, "1.25": -0.5, "2": -0.5}], by="noise", cells=CELL)),
     ("Table A14", "final returns", "all", "final_return_per_beta", published_final_returns),

@@ -191,17 +191,17 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
     weights: {value: weight} of a column `by`, {(value, ...): weight} of a list of columns. cells:
     columns, `environment` first, and at most one more.
 
-    Returns a dict: environments, and where there are any: mean; se, NaN where all groups have one
-    seed; df; by_seeds, the error that is left with all `of` environments; runs; made_of, in words;
-    lacks, in words, "" where there is enough: half of the environments, and three values of the
-    second column of cells, if any.
+    Returns a dict, empty where no cell has all groups: environments; mean; se, NaN where all groups
+    have one seed; df; by_seeds, the error that is left with all `of` environments; runs; made_of,
+    in words; lacks, in words, "" where there is enough: half of the environments, and three values
+    of the second column of cells, if any.
     """
     groups = runs.groupby([*cells, *([by] if isinstance(by, str) else by)]).z
     tables = groups.mean(), groups.var().fillna(0), groups.size()
     tables, weight = [table.unstack(by) for table in tables], pd.Series(weights, dtype=float)
     if not weights.keys() <= set(tables[0]):
-        return {"environments": 0}
-    tables = [table[list(weights)] for table in tables]
+        return {}
+    tables = [table.iloc[:, table.columns.get_indexer(weight.index)] for table in tables]
     there, two = tables[2].notna().all(axis=1), (tables[2] > 1).all(axis=1)
     chosen, lacks, made_of = tables[2].index[two if two.any() else there], "", ""
     if len(cells) > 1:
@@ -210,7 +210,7 @@ def contrast(runs, weights, by, cells=("environment",), of=16):
         made_of = f", {cells[1]} {', '.join(f'{value:g}' for value in sorted(shared))}"
     mean, variance, seeds = (table.loc[chosen] for table in tables)
     if mean.empty:
-        return {"environments": 0}
+        return {}
     seeds_of = seeds.groupby("environment")
     df = (seeds - 1).groupby("environment").sum().sum(axis=1)
     squares = (variance * (seeds - 1)).groupby("environment").sum().sum(axis=1)
