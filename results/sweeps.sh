@@ -64,13 +64,10 @@ python -m study.runs pack variants/ results/variants.csv --overwrite
 python -m study.runs pack noise_length/ results/noise_length.csv --overwrite
 
 # new_seeds.csv: cells that seemed off, run anew
-./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs 4 --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10
-./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_64 --n-envs 4 --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10 --batch-size 64
+./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs "4 1" --betas 0 --seeds "$(echo {101..110} {201..220})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10
+./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_64 --n-envs "4 1" --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10 --batch-size 64
 ./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs 4 --betas "0 0.5" --seeds "$(echo {101..110})" --envs cartpole-swingup_sparse -- --eval-freq 204800 --eval-episodes 10
 ./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_64 --n-envs 4 --betas "0 0.5" --seeds 101 --envs cartpole-swingup_sparse -- --eval-freq 204800 --eval-episodes 10 --batch-size 64
-./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs 1 --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10
-./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_64 --n-envs 1 --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10 --batch-size 64
-./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs "4 1" --betas 0 --seeds "$(echo {201..220})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10
 ./run_sweep.sh main --runs-dir new_seeds --exp-name bootstrap --n-envs "4 1" --betas 0 --seeds "$(echo {101..110})" --envs pendulum-swingup -- --eval-freq 204800 --eval-episodes 10 --bootstrap-timeouts
 ./run_sweep.sh main --runs-dir new_seeds --exp-name batch_size_128 --n-envs "32 128" --betas 0 --seeds "$(echo {101..110})" --envs MountainCarContinuous -- --eval-freq 204800 --eval-episodes 10
 python -m study.runs pack new_seeds/ results/new_seeds.csv --overwrite

@@ -9,8 +9,8 @@ hyperparameters for these methods, and its released code does not have them. The
 of Stable-Baselines3 (A2C, gSDE) and sb3-contrib (TRPO), with 4 environments.
 """
 
-import argparse
 import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 import torch
 from torch import nn
@@ -170,11 +170,8 @@ METHODS = {
 
 
 def main(argv):
-    parser = argparse.ArgumentParser(
-        usage="python -m study.methods METHOD [flags of ppo_colored_continuous.py]",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.usage = "python -m study.methods METHOD [flags of ppo_colored_continuous.py]"
     parser.add_argument("method", choices=METHODS)
     name = parser.parse_args(argv[:1]).method
     method, flags = METHODS[name], argv[1:]

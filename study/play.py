@@ -11,9 +11,9 @@ in Gymnasium's environment, even if it was trained in EnvPool's.
 In Python, `load_policy(RUN)` gives the policy and an environment to play it in.
 """
 
-import argparse
 import contextlib
 import json
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from pathlib import Path
 
 import gymnasium as gym
@@ -27,8 +27,7 @@ from study.normalization import NormalizedVectorEnv
 
 
 def parse_args(argv=None):
-    formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("run", type=Path, metavar="RUN", help="folder of a run")
     add("--episodes", type=int, help="number of episodes (10; 1 with --video)")
@@ -65,7 +64,7 @@ def load_policy(run, best=False, beta=None, seed=1, render_mode=None):
     """
     recorded = json.loads((Path(run) / "config.json").read_text())["args"]
     # Arguments that an older version of the script did not have get their defaults
-    run_args = argparse.Namespace(**{**vars(ppo.parse_args([])), **recorded})
+    run_args = Namespace(**{**vars(ppo.parse_args([])), **recorded})
     saved = torch.load(Path(run) / ("best.pt" if best else "checkpoint.pt"), weights_only=True)
     env = make_env(run_args, saved.get("normalization"), render_mode)
     space = env.single_action_space

@@ -62,11 +62,11 @@ SETTINGS = {
 # Gymnasium's MuJoCo tasks with the settings that are usual there (results/plans.md): CleanRL's with
 # one environment, and many environments with short rollouts, as on GPUs
 GYMNASIUM = ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "Humanoid-v5"]
-usual = "--total-timesteps 1000000 --eval-freq 50000 --eval-episodes 10 --learning-rate 3e-4 "
-usual += "--anneal-lr --normalize-obs --normalize-rewards"
+USUAL = "--total-timesteps 1000000 --eval-freq 50000 --eval-episodes 10 --learning-rate 3e-4 "
+USUAL += "--anneal-lr --normalize-obs --normalize-rewards"
 GYMNASIUM_FLAGS = {  # by n_envs
-    1: f"{usual} --n-steps 2048 --batch-size 64".split(),
-    32: f"{usual} --n-steps 128 --batch-size 512".split(),
+    1: f"{USUAL} --n-steps 2048 --batch-size 64".split(),
+    32: f"{USUAL} --n-steps 128 --batch-size 512".split(),
 }
 
 # What run_sweep.sh varies: the values of each axis that a preset does not give otherwise
@@ -90,7 +90,7 @@ def bootstraps(env_id):
     return not env_id.startswith("dm_control/")
 
 
-def ids_named(word, ids=NAMES):
-    """Those of the ids that the word names: in full, or short as cheetah-run."""
+def ids_named(word, names=NAMES):
+    """Those of the ids that the word names: in full, short as cheetah-run, or as in the paper."""
     pattern = rf"(dm_control/)?{re.escape(word)}(-v\d+)?"
-    return [env_id for env_id in ids if re.fullmatch(pattern, env_id)]
+    return [i for i, name in names.items() if re.fullmatch(pattern, i) or name == word]

@@ -120,26 +120,17 @@ def load(paths, env=None, beta=None, n_envs=None):
     # learning curve
     runs["performance"] = curves.mean(axis=1).round(9)  # the digits behind depend on other rows
     runs["final_return"] = curves.ffill(axis=1).iloc[:, -1]
-    # Bootstraps draw by position: in whatever order runs are read, their intervals are the same
-    runs = asked_for(runs, env, beta, n_envs).sort_values(AXES, kind="stable")
-    return runs, curves.loc[runs.index]
-
-
-def asked_for(runs, env, beta, n_envs):
-    """The runs that `load` keeps."""
     names = dict(zip(runs.env_id, runs.environment, strict=True))
-
-    def ids(name):
-        return ids_named(name, names) or [i for i in names if names[i] == name] or [name]
-
-    env = env and [env_id for name in env for env_id in ids(name)]
+    env = env and [env_id for name in env for env_id in ids_named(name, names) or [name]]
     for column, wanted in (("env_id", env), ("beta", beta), ("n_envs", n_envs)):
         there = sorted(runs[column].unique().tolist())
         for value in wanted or []:
             need(value in there, f"runs with {column} {value}; there are: {there}")
         if wanted:  # runs with gSDE have no beta to go by
             runs = runs[runs[column].isin([*wanted, "gsde"])]
-    return runs
+    # Bootstraps draw by position: in whatever order runs are read, their intervals are the same
+    runs = runs.sort_values(AXES, kind="stable")
+    return runs, curves.loc[runs.index]
 
 
 def pack(runs, curves, file, overwrite=False):
