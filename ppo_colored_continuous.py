@@ -22,6 +22,7 @@ import json
 import math
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -103,7 +104,8 @@ def parse_args(argv=None, **defaults):
     parser.set_defaults(**{"method": "ppo", **defaults})  # other methods: study/methods.py
     args = parser.parse_args(argv)
 
-    if min(args.eval_freq, args.eval_episodes, args.n_envs, args.n_steps, args.batch_size) < 1:
+    counts = args.total_timesteps, args.eval_freq, args.eval_episodes
+    if min(*counts, args.n_envs, args.n_steps, args.batch_size) < 1:
         parser.error("numbers of steps, episodes and environments must be positive")
     last_evaluation = args.total_timesteps // args.eval_freq * args.eval_freq
     if last_evaluation < args.n_envs * args.n_steps:
@@ -202,6 +204,8 @@ def make_env(args, render_mode=None):
 
         if args.max_episode_steps:  # the task's own limit, in seconds, would come first
             kwargs["task_kwargs"] = {"time_limit": math.inf} | kwargs.get("task_kwargs", {})
+    if os.getcwd() not in sys.path:  # where my_env.py of my_env:MyEnv-v0 may be
+        sys.path.append(os.getcwd())
     # Gymnasium's checks of the first steps help authors of environments, but take time
     env = gym.make(args.env_id, args.max_episode_steps, disable_env_checker=True, **kwargs)
     space = env.action_space
@@ -446,8 +450,8 @@ def run_path(args):
     """Path of a run's folder: it shows the experiment, environment, beta, n_envs and seed."""
     beta = "beta_" + ("auto" if args.beta_auto else "_".join(f"{b:g}" for b in args.beta))
     beta = "gsde" if args.method == "gsde" else "vanilla" if args.vanilla else beta
-    env, n_envs, seed = args.env_id.replace("/", "_"), f"n_envs_{args.n_envs}", f"seed_{args.seed}"
-    return Path(args.runs_dir, args.exp_name, env.replace(":", "_"), beta, n_envs, seed)
+    path = Path(args.runs_dir) / args.exp_name / re.sub(r"[/:\\]", "_", args.env_id) / beta
+    return path / f"n_envs_{args.n_envs}" / f"seed_{args.seed}"
 
 
 def lock(path):
@@ -579,7 +583,6 @@ def make_seeds(n, *key):
 def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=learn,
          make_optimizer=make_optimizer):  # fmt: skip
     """Trains and evaluates as `args` say. Other methods replace the other arguments."""
-    sys.path.append(os.getcwd())  # where my_env.py of my_env:MyEnv-v0 may be
     torch.set_num_threads(1)
     random.seed(args.seed)  # some environments draw from these, also when they are made
     np.random.seed(args.seed)  # noqa: NPY002

@@ -24,7 +24,6 @@ from scipy import stats
 
 import plot
 from study import claims, questions
-from study.claims import HALF_OVER_WHITE
 from study.questions import RESULTS, complete, difference_text, mean_text
 from study.runs import CELL, Unusable, comparable, differences, load, main_grid, published, select
 from study.statistics import contrast, interval, interval_text, pooled_variances, standardize
@@ -145,7 +144,7 @@ def our_lead(n_envs, but=()):
     """
     part, cells = colored(n_envs), CELL[: len(n_envs)]
     part, of = part[~part.environment.isin(but)], 16 - len(but)
-    found = contrast(part.assign(z=standardize(part)), HALF_OVER_WHITE, "beta", cells, of)
+    found = contrast(part.assign(z=standardize(part)), claims.HALF_OVER_WHITE, "beta", cells, of)
     return part, found, interval_text(found["mean"], *interval(found))
 
 
@@ -167,7 +166,7 @@ def lead():
         theirs = theirs.assign(z=standardize(theirs))
         same = theirs[theirs.environment.isin(part.environment)]
         for name, cells in (("the same environments", same), ("all 16", theirs)):
-            paper_lead = contrast(cells, HALF_OVER_WHITE, "beta", CELL[: len(n_envs)])
+            paper_lead = contrast(cells, claims.HALF_OVER_WHITE, "beta", CELL[: len(n_envs)])
             row[f"paper, {name}"] = f"{paper_lead['mean']:z.2f}"
         rows.append(row)
     return markdown(rows)
