@@ -160,7 +160,8 @@ def lead():
     for n_envs, but in (([4], ()), ([1, 4, 32], ()), ([1, 4, 32], claims.SEEN)):
         part, ours, text = our_lead(n_envs, but)
         row = {"n_envs": ", ".join(map(str, n_envs))}
-        row["environments"] = f"{ours['environments']}{' not looked at before the plan' * bool(but)}"
+        row["environments"] = f"{ours['environments']}"
+        row["environments"] += " not looked at before the plan" * bool(but)
         row["ours [95 % interval]"] = text
         theirs = paper[paper.n_envs.isin(n_envs)]
         theirs = theirs.assign(z=standardize(theirs))
