@@ -337,7 +337,7 @@ def unseen(runs, what, weights_of):
     if not seen:
         return found
     data = f"{found.data}; {words('seen before the test was chosen:', seen)}"
-    decides = f"the other {16 - len(SEEN)} environments"
+    decides = f"the other {16 - len(SEEN)} environments" if before.all() else found.decides
     return dataclasses.replace(found, data=data, decides=decides)
 
 

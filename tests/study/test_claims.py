@@ -157,6 +157,9 @@ def test_trends_are_decided_by_environments_that_were_not_seen_before(made_up):
     few = runs[runs.environment.isin(claims.SEEN)]
     found = claim(few)
     assert found.verdict == "open" and found.decides == "the other 7 environments"
+    weak = made_up(lambda e, beta, n: 0.01 * beta * np.log2(n))
+    found = claim(weak.assign(z=standardize(weak)))
+    assert found.verdict == "open" and re.match(r"[\d,]+ runs more, if", found.decides)
 
 
 def test_runs_of_a_few_environments_change_no_verdict_on_all(made_up, coverage):
