@@ -285,7 +285,7 @@ def speed():
 def waiting():
     """Seconds until the first training step is done, and of what comes before it."""
     table = pd.read_csv(RESULTS / "speed.csv").dropna(subset="seconds")
-    parts = [f"{row.contender}: {row.seconds:.1f}" for row in table.itertuples()]
+    parts = [f"{row.contender}: {row.seconds:.2g}" for row in table.itertuples()]
     return f"Seconds that one waits. {'; '.join(parts)}.\n"
 
 

@@ -22,6 +22,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import ppo_colored_continuous as ppo
+from study import environments
 
 SETTINGS = ["n_steps", "batch_size", "n_epochs", "learning_rate", "gamma", "gae_lambda"]
 SETTINGS += ["clip_range", "normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm", "seed"]
@@ -84,6 +85,7 @@ def parse_args(argv):
 
 def main(args):
     torch.set_num_threads(1)
+    environments.quiet_packages()
     with ppo.lock(ppo.run_path(args)):
         run = ppo.Run(args)
         if run.complete:
