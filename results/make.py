@@ -188,7 +188,8 @@ def leads():
         )
         verdict = claims.judge(*interval(found))
         parts.append(f"{text} ({found['environments']} {where}: {verdict})")
-    return f"Average lead of β = 0.5 over white noise, in standard deviations: {', '.join(parts)}.\n"
+    what = "Average lead of β = 0.5 over white noise, in standard deviations"
+    return f"{what}: {', '.join(parts)}.\n"
 
 
 def undecided():
