@@ -49,14 +49,16 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
     ("ends", "verdict"),
     [("0.01 to 0.60", "helps"), ("-0.60 to -0.01", "hurts"), ("-0.60 to 0.01", "no difference")],
 )
-def test_gymnasium_is_judged_by_all_six_tasks(monkeypatch, ends, verdict):
+def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, ends, verdict):
     columns = ["A: 0.5 over 0", "B: 0.5 over 0", "1 over 0: B less A"]
     rows = ["average", "for these tasks, 95 %", "the same, 98.3 %", "for tasks like these, 95 %"]
     table = pd.DataFrame({"task": [*GYMNASIUM, *rows]} | dict.fromkeys(columns, ends))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
+    cells = {cell: [0.0] * 8 for cell in range(36)}
+    monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)
     assert make.gymnasium().count(verdict) == 3
-    monkeypatch.setattr(make.questions, "gymnasium", lambda: table[1:])
-    assert verdict not in make.gymnasium()
+    cells[0].pop()
+    assert verdict not in make.gymnasium() and "287 of" in make.gymnasium()
 
 
 @pytest.mark.parametrize(("change", "same"), [(2, True), (200, False)])
@@ -86,5 +88,5 @@ def test_every_run_is_of_a_command():
             runs = {Path(path).parts[-4:] for path in make.complete(file)[0].path}
             assert runs and not runs - listed, file
     others = {path.name for path in RESULTS.glob("*.csv")} - {*found}
-    others -= {"speed.csv", "halfcheetah.csv", "halfcheetah_no_bootstrap.csv"}
-    assert others == {"point_with_friction.csv"}  # by the same commands, as the notes say
+    # speed.csv has no runs; those of the other are by the same commands, as the notes say
+    assert others == {"speed.csv", "point_with_friction.csv"}
