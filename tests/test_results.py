@@ -10,7 +10,6 @@ from PIL import Image
 
 from results import make
 from study import sweep
-from study.protocol import GYMNASIUM
 
 RESULTS = Path(make.__file__).parent
 
@@ -46,13 +45,17 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("ends", "verdict"),
-    [("0.01 to 0.60", "helps"), ("-0.60 to -0.01", "hurts"), ("-0.60 to 0.01", "no difference")],
+    ("average", "stricter", "verdict"),
+    [
+        ("0.30 [0.01, 0.59]", "0.30 [-0.04, 0.64]", "it helps\n"),
+        ("-0.40 [-0.69, -0.11]", "-0.40 [-0.74, -0.06]", "it hurts (at 98.3 %, too)\n"),
+        ("-0.20 [-0.49, 0.09]", "-0.20 [-0.54, 0.14]", "no difference found\n"),
+    ],
 )
-def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, ends, verdict):
+def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, average, stricter, verdict):
     columns = ["A: 0.5 over 0", "B: 0.5 over 0", "1 over 0: B less A"]
-    rows = ["average", "for these tasks, 95 %", "the same, 98.3 %", "for tasks like these, 95 %"]
-    table = pd.DataFrame({"task": [*GYMNASIUM, *rows]} | dict.fromkeys(columns, ends))
+    rows = {"task": ["average, these tasks, 95 %", "the same, 98.3 %"]}
+    table = pd.DataFrame(rows | dict.fromkeys(columns, [average, stricter]))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
     cells = {cell: [0.0] * 8 for cell in range(36)}
     monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)

@@ -1,5 +1,6 @@
 """study/questions.py on made-up runs, beside numbers that were put in."""
 
+import functools
 import re
 
 import numpy as np
@@ -8,6 +9,13 @@ from scipy import stats
 
 from study import questions
 from study.protocol import GYMNASIUM
+
+approx = functools.partial(pytest.approx, abs=0.005)
+
+
+def numbers(text):
+    """The three of "mean [low, high]"."""
+    return list(map(float, re.findall(r"[-\d.]+", text)))
 
 
 def test_leads_in_gymnasium_are_those_put_in(monkeypatch):
@@ -20,15 +28,18 @@ def test_leads_in_gymnasium_are_those_put_in(monkeypatch):
                 scores[task, n_envs, beta] = 10**scale * ((x - x.mean()) / x.std(ddof=1) + lead)
     monkeypatch.setattr(questions, "gymnasium_scores", lambda last=5: scores)
     table = questions.gymnasium().set_index("task")
-    assert (table["A: 0.5 over 0"][GYMNASIUM].astype(float) == 1).all()
-    assert table.loc["average"].astype(float).tolist() == [1, 0, 1, -0.5, -0.5]
+    own = stats.t.ppf(1 - 0.05 / 6 / 2, 21) * (2 / 8) ** 0.5
+    for task in GYMNASIUM:
+        assert numbers(table["A: 0.5 over 0"][task]) == approx([1, 1 - own, 1 + own])
+    means = [numbers(text)[0] for text in table.loc["average, these tasks, 95 %"]]
+    assert means == [1, 0, 1, -0.5, -0.5]
     half = stats.t.ppf(0.975, 6 * 21) * (2 / 8 / 6) ** 0.5
-    ends = table["A: 0.5 over 0"]["for these tasks, 95 %"].split(" to ")
-    assert [float(end) for end in ends] == pytest.approx([1 - half, 1 + half], abs=0.005)
-    assert table["A: 0.5 over 0"]["for tasks like these, 95 %"] == "1.00 to 1.00"
+    average = numbers(table["A: 0.5 over 0"]["average, these tasks, 95 %"])
+    assert average == approx([1, 1 - half, 1 + half])
+    assert table["A: 0.5 over 0"]["average, tasks like these, 95 %"] == "1.00 [1.00, 1.00]"
     baseline = questions.gymnasium_baseline().set_index("task")
     assert baseline["SB3 zoo (v3)"]["Hopper-v5"] == "one tuned run 2410"
-    mean, low, high = map(float, re.findall(r"[-\d.]+", baseline["this script (v5)"]["Hopper-v5"]))
+    mean, low, high = numbers(baseline["this script (v5)"]["Hopper-v5"])
     assert mean == 0 and -80 < low < -50 and 50 < high < 80  # of 8 with standard deviation 100
 
 
@@ -44,7 +55,7 @@ def test_the_interval_of_these_tasks_holds_what_it_should(monkeypatch):
         }
         monkeypatch.setattr(questions, "gymnasium_scores", lambda last, made=scores: made)
         table = questions.gymnasium().set_index("task")["A: 0.5 over 0"]
-        low, high = map(float, table["for these tasks, 95 %"].split(" to "))
+        _, low, high = numbers(table["average, these tasks, 95 %"])
         held += low < leads.mean() < high
     assert 0.9 <= held / 200 <= 0.99
 
