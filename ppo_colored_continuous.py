@@ -322,12 +322,8 @@ def compute_gae(rewards, values, dones, last_values, gamma, gae_lambda):
 
 
 # --- Learning
-def trainable(agent):
-    return [p for p in agent.parameters() if p.requires_grad]
-
-
 def make_optimizer(agent, args):
-    return torch.optim.Adam(trainable(agent), lr=args.learning_rate, eps=1e-5, fused=True)
+    return torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
 
 def ppo_loss(agent, minibatch, args):
@@ -354,35 +350,35 @@ def ppo_loss(agent, minibatch, args):
     return loss, metrics | {"approx_kl": approx_kl, "clip_fraction": clip_fraction}
 
 
-def loss_gradients(loss_function, agent, minibatch, args):
-    """Returns the gradients of the loss, scaled down to --max-grad-norm, and metrics to log.
+def loss_backward(loss_function, agent, minibatch, args):
+    """Sets the gradients of the loss, scaled down to --max-grad-norm. Returns metrics to log.
 
     This is loss.backward() and clip_grad_norm_(), in a form of which torch.compile makes one graph,
     with the loss: a third of the time of --no-compile. A number in args may change during training.
     Make it a tensor: with a Python number each new value compiles the graph again, 10 seconds.
     """
     loss, metrics = loss_function(agent, minibatch, args)
+    params = [p for p in agent.parameters() if p.requires_grad]
     # materialize_grads: zeros for parameters that the loss does not use
-    grads = torch.autograd.grad(loss, trainable(agent), materialize_grads=True)
+    grads = torch.autograd.grad(loss, params, materialize_grads=True)
     norm = sum(grad.square().sum() for grad in grads).sqrt()
     scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-    metrics = {name: value.detach() for name, value in metrics.items()}
-    return [grad * scale for grad in grads], metrics
+    for parameter, grad in zip(params, grads, strict=True):
+        parameter.grad = grad * scale
+    return {name: value.detach() for name, value in metrics.items()}
 
 
-def learn(agent, optimizer, batch, gradients, args):
+def learn(agent, optimizer, batch, backward, args):
     """Several epochs of minibatches. Returns metrics to log, averaged over the minibatches."""
-    params, all_metrics = trainable(agent), []
+    all_metrics = []
     for _ in range(args.n_epochs):
         permutation = torch.randperm(len(batch[0])).to(args.device)
         shuffled = [x[permutation] for x in batch]
         for start in range(0, len(permutation), args.batch_size):
             minibatch = [x[start : start + args.batch_size] for x in shuffled]
-            grads, metrics = gradients(agent, minibatch, args)
-            for parameter, grad in zip(params, grads, strict=True):
-                parameter.grad = grad  # replaces the old one: no zero_grad()
+            optimizer.zero_grad()
+            all_metrics.append(backward(agent, minibatch, args))
             optimizer.step()
-            all_metrics.append(metrics)
     return {name: torch.stack([m[name] for m in all_metrics]).mean() for name in all_metrics[0]}
 
 
@@ -612,8 +608,8 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
             run.checkpoint["optimizer"]["param_groups"] = optimizer.state_dict()["param_groups"]
             for name, part in saved.items():
                 part.load_state_dict(run.checkpoint[name])
-        gradients = functools.partial(loss_gradients, loss)
-        gradients = compiled(gradients) if args.compile else gradients
+        backward = functools.partial(loss_backward, loss)
+        backward = compiled(backward) if args.compile else backward
         # The state of environments cannot be saved: after a resume they begin new episodes
         obs, _ = envs.reset(seed=make_seeds(args.n_envs, args.seed, 1, global_step))
         steps_per_update = args.n_steps * args.n_envs
@@ -634,7 +630,7 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
                     group["lr"] = rate * (1 - global_step / total)
             act = exploration(agent, noise, args)
             batch, obs, ended = collect(agent, act, envs, obs, so_far, args, bar)
-            losses = learn(agent, optimizer, batch, gradients, args)
+            losses = learn(agent, optimizer, batch, backward, args)
             global_step += steps_per_update
             if not nn.utils.parameters_to_vector(agent.parameters()).isfinite().all():
                 raise FloatingPointError("training diverged: lower --learning-rate")

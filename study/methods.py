@@ -32,7 +32,7 @@ def a2c_loss(agent, batch, args):
 
 
 def a2c_optimizer(agent, args):
-    return torch.optim.RMSprop(ppo.trainable(agent), args.learning_rate, alpha=0.99, eps=1e-5)
+    return torch.optim.RMSprop(agent.parameters(), args.learning_rate, alpha=0.99, eps=1e-5)
 
 
 # --- TRPO (Schulman et al. 2015): the largest step along the natural gradient that keeps KL < 0.01
@@ -104,13 +104,13 @@ def critic_loss(agent, minibatch, args):
     return loss, {"value_loss": loss}
 
 
-def trpo_learn(agent, optimizer, batch, gradients, args):
+def trpo_learn(agent, optimizer, batch, backward, args):
     """In place of ppo.learn: a step of the actor on the whole batch, then epochs of the critic."""
     obs, actions, logprobs, advantages, *rest = batch
     if args.normalize_advantage:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     metrics = trpo_actor(agent, (obs, actions, logprobs, advantages, *rest))
-    return ppo.learn(agent, optimizer, batch, gradients, args) | metrics
+    return ppo.learn(agent, optimizer, batch, backward, args) | metrics
 
 
 # --- gSDE (Raffin et al. 2021): noise that is a function of the state, one function per rollout

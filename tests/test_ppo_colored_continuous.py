@@ -124,7 +124,7 @@ def test_loss_and_gradient(fill_buffer, flags, settings):
     agent, sb3, args = make_pair(flags, **settings)
     minibatch = random_minibatch(agent)
     loss, _ = ppo.ppo_loss(agent, minibatch, args)
-    grads, metrics = ppo.loss_gradients(ppo.ppo_loss, agent, minibatch, args)
+    metrics = ppo.loss_backward(ppo.ppo_loss, agent, minibatch, args)
     fill_buffer(sb3, minibatch)
     sb3.train()
     logged = sb3.logger.name_to_value
@@ -137,7 +137,7 @@ def test_loss_and_gradient(fill_buffer, flags, settings):
     assert ours["clip_fraction"] == pytest.approx(logged["train/clip_fraction"])
     assert 0.2 < ours["clip_fraction"] < 0.8
     theirs = [p.grad for p in as_agent(sb3.policy).parameters()]
-    torch.testing.assert_close(list(grads), theirs, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close([p.grad for p in agent.parameters()], theirs, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("compile", [False, True])
@@ -145,8 +145,8 @@ def test_parameters_after_steps_of_adam(fill_buffer, compile, capsys):
     """At falling rates, eager and compiled; eager, the last of a smaller minibatch."""
     agent, sb3, args = make_pair()
     optimizer = ppo.make_optimizer(agent, args)
-    gradients = ppo.functools.partial(ppo.loss_gradients, ppo.ppo_loss)
-    gradients = ppo.compiled(gradients) if compile else gradients
+    backward = ppo.functools.partial(ppo.loss_backward, ppo.ppo_loss)
+    backward = ppo.compiled(backward) if compile else backward
     minibatch, before = random_minibatch(agent), parameters(agent)
     args.n_epochs, args.batch_size = 1, N_STEPS * N_ENVS
     for rate, n in [(1e-3, 192), (8e-4, 192), (5e-4, 192), (2e-4, 192 if compile else 96)]:
@@ -156,7 +156,7 @@ def test_parameters_after_steps_of_adam(fill_buffer, compile, capsys):
         sb3.lr_schedule = lambda _, rate=rate: rate
         sb3.train()
         optimizer.param_groups[0]["lr"] = rate
-        ppo.learn(agent, optimizer, part, gradients, args)
+        ppo.learn(agent, optimizer, part, backward, args)
     after = parameters(as_agent(sb3.policy))
     assert (after - before).abs().max() > 2e-3
     torch.testing.assert_close(parameters(agent), after, rtol=1e-4, atol=2e-5)
@@ -584,10 +584,17 @@ def test_frozen_and_shared_parameters(run_edited):
     torch.testing.assert_close(parameters(agent), parameters(eager), rtol=1e-3, atol=1e-3)
 
 
+def test_a_parameter_frozen_in_the_loop(run_edited):
+    freeze = "            agent.log_std.requires_grad_(global_step < 1024)\n"
+    _, scalars, _ = run_edited((LOOP, freeze + LOOP))
+    first, *others = scalars["losses/std"]
+    assert first != others[0] and others == [others[0]] * 3
+
+
 def test_another_optimizer(run_edited):
     agent, *_ = run_edited()
-    decayed, *_ = run_edited(("torch.optim.Adam(trainable(agent)",
-                              "torch.optim.AdamW(trainable(agent), weight_decay=10.0"))  # fmt: skip
+    edit = "Adam(agent.parameters()", "AdamW(agent.parameters(), weight_decay=10.0"
+    decayed, *_ = run_edited(edit)
     assert parameters(decayed).norm() < 0.6 * parameters(agent).norm()
 
 
@@ -614,7 +621,7 @@ def test_learning_rates_of_the_actor_and_the_critic_are_both_annealed(run_edited
         {"params": agent.critic.parameters(), "lr": 1e-2},
     ]"""
     start, *_ = run_edited(learn=lambda *_: {})
-    agent, *_ = run_edited(("Adam(trainable(agent)", f"Adam({groups}"), flags="--anneal-lr")
+    agent, *_ = run_edited(("Adam(agent.parameters()", f"Adam({groups}"), flags="--anneal-lr")
     change = [
         (a - b).abs().max() for a, b in zip(agent.parameters(), start.parameters(), strict=True)
     ]

@@ -76,8 +76,8 @@ def random_batch(agent, seed=2):
 def learn(method, agent, optimizer, batch, args):
     """An update, as ppo.main makes it with what the method replaces."""
     replaces = {"loss": ppo.ppo_loss, "learn": ppo.learn} | methods.METHODS[method]["replaces"]
-    gradients = functools.partial(ppo.loss_gradients, replaces["loss"])
-    return replaces["learn"](agent, optimizer, batch, gradients, args)
+    backward = functools.partial(ppo.loss_backward, replaces["loss"])
+    return replaces["learn"](agent, optimizer, batch, backward, args)
 
 
 def test_a2c_after_five_updates(fill_buffer):
@@ -138,11 +138,12 @@ def test_gsde_density_entropy_and_gradient(fill_buffer):
     torch.testing.assert_close(entropy, their_entropy.mean(), rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(values, their_values.squeeze(-1))
     args.ent_coef = theirs.ent_coef = 0.01
-    grads, _ = ppo.loss_gradients(ppo.ppo_loss, agent, batch, args)
+    ppo.loss_backward(ppo.ppo_loss, agent, batch, args)
     fill_buffer(theirs, batch)
     theirs.train()
-    their_grads = flat(theirs.grad for _, theirs in pairs(agent, theirs.policy))
-    torch.testing.assert_close(flat(grads), their_grads, rtol=2e-3, atol=2e-6)
+    grads = [(ours.grad, their.grad) for ours, their in pairs(agent, theirs.policy)]
+    ours, their = map(flat, zip(*grads, strict=True))
+    torch.testing.assert_close(ours, their, rtol=2e-3, atol=2e-6)
 
 
 def test_gsde_noise():
