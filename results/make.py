@@ -252,7 +252,7 @@ def helps_or_hurts(interval):
 
 def gymnasium():
     """What the runs of Gymnasium's tasks say, once there are all, in the words of plans.md."""
-    made = sum(map(len, questions.gymnasium_scores().values()))
+    made = len(complete("gymnasium.csv")[0])
     if made < 288:
         runs = f"{made} of [288 planned runs](results/plans.md)"
         return f"In Gymnasium's MuJoCo tasks {runs} are made: no answer yet.\n"
@@ -322,7 +322,8 @@ def draw(folder):
     todo = plot.results(*study_runs(), BETAS)
     if "gymnasium" in FIGURES:
         runs, curves = complete("gymnasium.csv")
-        runs = runs.astype({"beta": float})
+        made = {task for task, _, _ in questions.gymnasium_scores()}
+        runs = runs[runs.env_id.isin(made)].astype({"beta": float})
         runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
         todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
     tables = {todo[name][1] for name in FIGURES if isinstance(todo[name][1], str)}

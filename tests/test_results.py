@@ -57,10 +57,10 @@ def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, average, stricter, ver
     rows = {"task": ["average, these tasks, 95 %", "the same, 98.3 %"]}
     table = pd.DataFrame(rows | dict.fromkeys(columns, [average, stricter]))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
-    cells = {cell: [0.0] * 8 for cell in range(36)}
-    monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)
+    made = [*range(288)]
+    monkeypatch.setattr(make, "complete", lambda file: (made, None))
     assert make.gymnasium().count(verdict) == 3
-    cells[0].pop()
+    made.pop()
     assert verdict not in make.gymnasium() and "287 of" in make.gymnasium()
 
 
