@@ -140,6 +140,15 @@ def test_loss_and_gradient(fill_buffer, flags, settings):
     torch.testing.assert_close([p.grad for p in agent.parameters()], theirs, rtol=1e-3, atol=1e-6)
 
 
+def test_gradients_are_added_as_backward_adds_them():
+    agent, _, args = make_pair()
+    minibatch = random_minibatch(agent)
+    ppo.loss_backward(ppo.ppo_loss, agent, minibatch, args)
+    once = [p.grad.clone() for p in agent.parameters()]
+    ppo.loss_backward(ppo.ppo_loss, agent, minibatch, args)
+    torch.testing.assert_close([p.grad for p in agent.parameters()], [2 * grad for grad in once])
+
+
 @pytest.mark.parametrize("compile", [False, True])
 def test_parameters_after_steps_of_adam(fill_buffer, compile, capsys):
     """At falling rates, eager and compiled; eager, the last of a smaller minibatch."""
