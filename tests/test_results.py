@@ -57,10 +57,11 @@ def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, average, stricter, ver
     rows = {"task": ["average, these tasks, 95 %", "the same, 98.3 %"]}
     table = pd.DataFrame(rows | dict.fromkeys(columns, [average, stricter]))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
-    made = [*range(288)]
-    monkeypatch.setattr(make, "complete", lambda file: (made, None))
+    cells = [*range(36)]
+    monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)
     assert make.gymnasium().count(verdict) == 3
-    made.pop()
+    cells.pop()
+    monkeypatch.setattr(make, "complete", lambda file: (range(287), None))
     assert verdict not in make.gymnasium() and "287 of" in make.gymnasium()
 
 
