@@ -36,8 +36,8 @@ FIGURES = [  # names as in plot.py, of these files
     *("claims", "performance_vs_beta", "n_envs_beta_grids", "beside_published", "beta0_vs_vanilla"),
     *("n_envs_vs_n_steps", "n_epochs_vs_beta", "complex_tasks", "transfer", "gsde_vs_beta"),
     *(f"learning_curves_n_envs_{n_envs}" for n_envs in (1, 4, 32)),
+    "gymnasium",
 ]
-FIGURES += ["gymnasium"] * (RESULTS / "gymnasium.csv").exists()
 TOLERANCE = 32
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 BETAS = [0, 0.5, 1]
@@ -320,12 +320,11 @@ TABLES = {make.__name__: make for make in TABLES} | {"planned": questions.answer
 def draw(folder):
     """Draws all figures to a folder; returns their paths."""
     todo = plot.results(*study_runs(), BETAS)
-    if "gymnasium" in FIGURES:
-        runs, curves = complete("gymnasium.csv")
-        made = {task for task, _, _ in questions.gymnasium_scores()}
-        runs = runs[runs.env_id.isin(made)].astype({"beta": float})
-        runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
-        todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
+    runs, curves = complete("gymnasium.csv")
+    made = {task for task, _, _ in questions.gymnasium_scores()}
+    runs = runs[runs.env_id.isin(made)].astype({"beta": float})
+    runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
+    todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
     tables = {todo[name][1] for name in FIGURES if isinstance(todo[name][1], str)}
     todo = {name: todo[name] for name in [*tables, *FIGURES]}
     todo["noise_random_walks"] = (plot.random_walks, BETAS)

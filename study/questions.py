@@ -2,8 +2,7 @@
 
     python -m study.questions
 
-prints them as Markdown tables, from the packed runs in results/, those on Gymnasium once its runs
-are there.
+prints them as Markdown tables, from the packed runs in results/.
 """
 
 import functools
@@ -134,8 +133,6 @@ def gymnasium_scores(last=5):
     The mean of a run's last evaluations; of all twenty it is the area under the curve. Only tasks
     whose 48 runs are all made, so that no one looks before.
     """
-    if not (RESULTS / "gymnasium.csv").exists():
-        return {}
     runs, curves = complete("gymnasium.csv")
     scores = curves.dropna(axis=1).iloc[:, -last:].mean(axis=1)
     cells = scores.groupby([runs.env_id, runs.n_envs, runs.beta]).apply(np.array)
@@ -168,8 +165,6 @@ def gymnasium(last=5):
     """
     scores = gymnasium_scores(last)
     tasks = list(dict.fromkeys(task for task, _, _ in scores))
-    if not tasks:
-        return None
     columns = {
         f"{name}: {beta} over 0": np.array([lead(scores, task, n, beta) for task in tasks])
         for name, n in (("A", 1), ("B", 32))
@@ -200,7 +195,7 @@ def gymnasium_baseline():
     scores, paper = gymnasium_scores(), published("gymnasium").fillna("").set_index("task")
     tasks = dict.fromkeys(task for task, _, _ in scores)
     ours = [{"task": task, "this script (v5)": mean_text(scores[task, 1, "0"])} for task in tasks]
-    return pd.DataFrame(ours).join(paper, on="task") if ours else None
+    return pd.DataFrame(ours).join(paper, on="task")
 
 
 QUESTIONS = [stable_baselines3, pendulum_order, pendulum_beside_published, mountain_car, gymnasium]
@@ -208,10 +203,8 @@ QUESTIONS += [gymnasium_area, gymnasium_baseline]
 
 
 def answers():
-    """The answers, as Markdown, those on Gymnasium once there are runs."""
-    found = [(inspect.getdoc(question), question()) for question in QUESTIONS]
-    parts = [f"{doc}\n\n{markdown(table)}" for doc, table in found if table is not None]
-    return "\n".join(parts)
+    """The answers, as Markdown."""
+    return "\n".join(f"{inspect.getdoc(f)}\n\n{markdown(f())}" for f in QUESTIONS)
 
 
 if __name__ == "__main__":
