@@ -178,10 +178,9 @@ def gymnasium(last=5):
         texts = [student_text(x, variance**0.5, df, 1 - 0.05 / 6) for x, variance, df in found]
         (leads, variances, df), n = found.T, len(tasks)
         by_seeds = leads.mean(), variances.sum() ** 0.5 / n, df.sum()
-        texts += [student_text(*by_seeds), student_text(*by_seeds, 1 - 0.05 / 3), ""]
-        if n > 1:
-            texts[-1] = student_text(leads.mean(), leads.std(ddof=1) / n**0.5, n - 1)
-        table[name] = texts
+        by_tasks = leads.mean(), leads.std(ddof=1) / n**0.5, n - 1
+        texts += [student_text(*by_seeds), student_text(*by_seeds, 1 - 0.05 / 3)]
+        table[name] = [*texts, student_text(*by_tasks)]
     return table
 
 
