@@ -83,3 +83,7 @@ python -m study.runs pack sb3/ results/sb3.csv --overwrite
 # gymnasium.csv: Gymnasium's MuJoCo tasks with the settings in use today
 ./run_sweep.sh gymnasium --runs-dir gymnasium
 python -m study.runs pack gymnasium/ results/gymnasium.csv --overwrite
+
+# ant_without_contact_forces.csv: why white noise is low in Ant-v5
+./run_sweep.sh gymnasium --runs-dir ant --envs Ant-v5 --betas 0 --n-envs 1 --seeds "1 2 3" -- --env-kwargs '{"include_cfrc_ext_in_observation": false}'
+python -m study.runs pack ant/ results/ant_without_contact_forces.csv --overwrite
