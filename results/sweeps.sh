@@ -84,6 +84,6 @@ python -m study.runs pack sb3/ results/sb3.csv --overwrite
 ./run_sweep.sh gymnasium --runs-dir gymnasium
 python -m study.runs pack gymnasium/ results/gymnasium.csv --overwrite
 
-# ant_without_contact_forces.csv: why white noise is low in Ant-v5
+# gymnasium_baseline.csv: why white noise is low in Ant-v5
 ./run_sweep.sh gymnasium --runs-dir ant --envs Ant-v5 --betas 0 --n-envs 1 --seeds "1 2 3" -- --env-kwargs '{"include_cfrc_ext_in_observation": false}'
-python -m study.runs pack ant/ results/ant_without_contact_forces.csv --overwrite
+python -m study.runs pack ant/ results/gymnasium_baseline.csv --overwrite

@@ -14,7 +14,7 @@ import pandas as pd
 from scipy import stats
 
 from study.protocol import GYMNASIUM
-from study.runs import load, published
+from study.runs import differences, load, published
 from study.statistics import interval, interval_text, less_published, mean_interval
 from study.tables import markdown
 
@@ -190,11 +190,21 @@ def gymnasium_area():
 
 
 def gymnasium_baseline():
-    """Gymnasium, white noise: our mean of the last five evaluations in A, beside published PPO."""
-    scores, paper = gymnasium_scores(), published("gymnasium").fillna("").set_index("task")
+    """Gymnasium, white noise: our mean of the last five evaluations in A, beside published PPO.
+
+    Of runs with another flag, made to find out why a task is low: each seed's.
+    """
+    scores, paper = gymnasium_scores(), published("gymnasium").set_index("task")
     tasks = dict.fromkeys(task for task, _, _ in scores)
-    ours = [{"task": task, "this script (v5)": mean_text(scores[task, 1, "0"])} for task in tasks]
-    return pd.DataFrame(ours).join(paper, on="task")
+    ours = {(task, ""): mean_text(scores[task, 1, "0"]) for task in tasks}
+    runs, curves = complete("gymnasium_baseline.csv")
+    flags = differences(runs, ["env_kwargs", "gamma"])
+    for key, seeds in curves.iloc[:, -5:].mean(axis=1).groupby([runs.env_id, flags]):
+        ours[key] = ", ".join(map("{:.0f}".format, seeds))
+    table = pd.Series(ours, name="this script (v5)").rename_axis(["task", "flag"]).reset_index()
+    table = table.join(paper, on="task")
+    table.loc[table.flag != "", paper.columns] = np.nan  # the published are without the flag
+    return table.fillna("")
 
 
 QUESTIONS = [stable_baselines3, pendulum_order, pendulum_beside_published, mountain_car, gymnasium]
