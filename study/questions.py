@@ -195,16 +195,14 @@ def gymnasium_baseline():
     Of runs with another flag, made to find out why a task is low: each seed's.
     """
     scores, paper = gymnasium_scores(), published("gymnasium").set_index("task")
-    tasks = dict.fromkeys(task for task, _, _ in scores)
-    ours = {(task, ""): mean_text(scores[task, 1, "0"]) for task in tasks}
+    column, tasks = "this script (v5)", dict.fromkeys(task for task, _, _ in scores)
+    ours = [{"task": task, "flag": "", column: mean_text(scores[task, 1, "0"])} for task in tasks]
     runs, curves = complete("gymnasium_baseline.csv")
+    seeds = curves.iloc[:, -5:].mean(axis=1).map("{:.0f}".format)
     flags = differences(runs, ["env_kwargs", "gamma"])
-    for key, seeds in curves.iloc[:, -5:].mean(axis=1).groupby([runs.env_id, flags]):
-        ours[key] = ", ".join(map("{:.0f}".format, seeds))
-    table = pd.Series(ours, name="this script (v5)").rename_axis(["task", "flag"]).reset_index()
-    table = table.join(paper, on="task")
-    table.loc[table.flag != "", paper.columns] = np.nan  # the published are without the flag
-    return table.fillna("")
+    others = seeds.groupby([runs.env_id, flags]).agg(", ".join).rename_axis(["task", "flag"])
+    table = pd.DataFrame(ours).join(paper, on="task")
+    return pd.concat([table, others.reset_index(name=column)]).fillna("")
 
 
 QUESTIONS = [stable_baselines3, pendulum_order, pendulum_beside_published, mountain_car, gymnasium]
