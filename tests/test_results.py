@@ -45,24 +45,36 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("average", "stricter", "verdict"),
-    [
-        ("0.30 [0.01, 0.59]", "0.30 [-0.04, 0.64]", "it helps\n"),
-        ("-0.40 [-0.69, -0.11]", "-0.40 [-0.74, -0.06]", "it hurts (at 98.3 %, too)\n"),
-        ("-0.20 [-0.49, 0.09]", "-0.20 [-0.54, 0.14]", "no difference found\n"),
+    ("leads", "verdict", "gain", "in_tasks"),
+    [  # in Ant-v5; averages at 95 %, at 98.3 % and for tasks like these
+        (
+            ["0.9 [0.1, 1.7]", "0.3 [0.01, 0.6]", "0.3 [-0.1, 0.6]", "0.3 [-0.9, 1.5]"],
+            *("it helps |", "it gains |", "helps in Ant-v5 (n_envs 32)."),
+        ),
+        (
+            ["-2 [-3, -1]", "-0.4 [-0.7, -0.1]", "-0.4 [-0.7, -0.06]", "-0.4 [-0.8, 0.01]"],
+            *("it hurts (at 98.3 %, too) |", "it loses (at 98.3 %, too) |"),
+            "hurts in Ant-v5 (n_envs 32).",
+        ),
+        (
+            ["0.9 [-0.1, 1.9]", "-0.2 [-0.5, 0.1]", "-0.2 [-0.5, 0.2]", "-0.2 [-0.9, 0.7]"],
+            *("no difference found |", "no difference found |", "no difference that is found."),
+        ),
     ],
 )
-def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, average, stricter, verdict):
-    columns = ["A: 0.5 over 0", "B: 0.5 over 0", "1 over 0: B less A"]
-    rows = {"task": ["average, these tasks, 95 %", "the same, 98.3 %"]}
-    table = pd.DataFrame(rows | dict.fromkeys(columns, [average, stricter]))
+def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, leads, verdict, gain, in_tasks):
+    columns = ["A: 0.5 over 0", "A: 1 over 0", "B: 0.5 over 0", "B: 1 over 0", "1 over 0: B less A"]
+    rows = {"task": ["Ant-v5", "these tasks, 95 %", "98.3 %", "tasks like these, 95 %"]}
+    table = pd.DataFrame(rows | dict.fromkeys(columns, leads))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
     cells = [*range(36)]
     monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)
-    assert make.gymnasium().count(verdict) == 3
+    *_, first, second, less, _, last = make.gymnasium().splitlines()
+    assert f"{leads[1]}: {verdict}" in first and f"{leads[1]}: {verdict}" in second
+    assert less.endswith(f"{leads[1]}: {gain}") and last.endswith(in_tasks)
     cells.pop()
     monkeypatch.setattr(make, "complete", lambda file: (range(287), None))
-    assert verdict not in make.gymnasium() and "287 of" in make.gymnasium()
+    assert leads[1] not in make.gymnasium() and "287 of" in make.gymnasium()
 
 
 @pytest.mark.parametrize(("change", "same"), [(2, True), (200, False)])
