@@ -275,7 +275,7 @@ def gymnasium():
         tasks += [f"hurts in {task} (n_envs {n_envs})" for task in signs.index[signs < 0]]
     gain = judged(table["1 over 0: B less A"], "gains", "loses")
     rows.append({"": "the second less the first", "β = 0.5": "", "β = 1": gain})
-    what = "Average lead over white noise in Gymnasium's MuJoCo tasks with the usual settings"
+    what = "Average lead over white noise in six of Gymnasium's MuJoCo tasks, usual settings"
     found = ", ".join(tasks) or "makes no difference that is found"
     averages = f"{what}, in standard deviations:\n\n{markdown(rows)}\n"
     return f"{averages}In single tasks, at 99.2 %, β = 0.5 {found}.\n"
