@@ -605,8 +605,10 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         global_step = run.checkpoint["global_step"]
         if global_step:
             torch.set_rng_state(run.checkpoint["torch_rng"])
-            # The learning rate is that of make_optimizer now
-            run.checkpoint["optimizer"]["param_groups"] = optimizer.state_dict()["param_groups"]
+            # The learning rate is that of make_optimizer now, unless a torch scheduler sets it
+            groups = optimizer.state_dict()["param_groups"]
+            if "initial_lr" not in groups[0]:
+                run.checkpoint["optimizer"]["param_groups"] = groups
             for name, part in saved.items():
                 part.load_state_dict(run.checkpoint[name])
         backward = functools.partial(loss_backward, loss)

@@ -624,6 +624,27 @@ def test_another_noise_and_an_agent_changed_in_the_loop(run_edited):
         torch.testing.assert_close(actions, means + std)
 
 
+def test_a_saved_scheduler_goes_on_after_a_resume(run_edited):
+    """Of torch, one that computes each learning rate from the one before."""
+    optimizer = "        optimizer = make_optimizer(agent, args)\n"
+    update = "            losses = learn(agent, optimizer, batch, backward, args)\n"
+    make = "        scheduler = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)\n"
+    edits = [(optimizer, optimizer + make), (update, f"{update}            scheduler.step()\n")]
+    edits.append(('"noise": noise}', '"noise": noise, "scheduler": scheduler}'))
+    calls = []
+
+    def learn(*arguments):
+        if calls:
+            raise KeyboardInterrupt
+        calls.append(arguments)
+        return ppo.learn(*arguments)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_edited(*edits, learn=learn)
+    _, scalars, _ = run_edited(*edits, again="--resume")
+    assert scalars["losses/learning_rate"][-1] == pytest.approx(1e-2 * 0.5**4)
+
+
 def test_learning_rates_of_the_actor_and_the_critic_are_both_annealed(run_edited):
     groups = """[
         {"params": [*agent.actor_mean.parameters(), agent.log_std], "lr": 0.0},
