@@ -323,6 +323,7 @@ def compute_gae(rewards, values, dones, last_values, gamma, gae_lambda):
 
 # --- Learning
 def make_optimizer(agent, args):
+    # With --resume its settings, also the learning rate, are those of the checkpoint
     return torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
 
@@ -605,10 +606,6 @@ def main(args, make_agent=Agent, exploration=exploration, loss=ppo_loss, learn=l
         global_step = run.checkpoint["global_step"]
         if global_step:
             torch.set_rng_state(run.checkpoint["torch_rng"])
-            # The learning rate is that of make_optimizer now, unless a torch scheduler sets it
-            groups = optimizer.state_dict()["param_groups"]
-            if "initial_lr" not in groups[0]:
-                run.checkpoint["optimizer"]["param_groups"] = groups
             for name, part in saved.items():
                 part.load_state_dict(run.checkpoint[name])
         backward = functools.partial(loss_backward, loss)

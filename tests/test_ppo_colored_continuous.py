@@ -624,13 +624,16 @@ def test_another_noise_and_an_agent_changed_in_the_loop(run_edited):
         torch.testing.assert_close(actions, means + std)
 
 
-def test_a_saved_scheduler_goes_on_after_a_resume(run_edited):
-    """Of torch, one that computes each learning rate from the one before."""
+@pytest.mark.parametrize("scheduler", [True, False])
+def test_a_learning_rate_that_falls_goes_on_after_a_resume(run_edited, scheduler):
+    """Each is computed from the one before, by a saved scheduler of torch or in the loop."""
     optimizer = "        optimizer = make_optimizer(agent, args)\n"
     update = "            losses = learn(agent, optimizer, batch, backward, args)\n"
     make = "        scheduler = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)\n"
     edits = [(optimizer, optimizer + make), (update, f"{update}            scheduler.step()\n")]
     edits.append(('"noise": noise}', '"noise": noise, "scheduler": scheduler}'))
+    if not scheduler:
+        edits = [(update, f'{update}            optimizer.param_groups[0]["lr"] *= 0.5\n')]
     calls = []
 
     def learn(*arguments):
