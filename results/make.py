@@ -120,21 +120,19 @@ def ahead():
     runs = main_runs()
     ahead, behind, found, _ = claims.ahead_in(runs.assign(z=standardize(runs)), 0.5)
     n_runs, rest = sum(x["runs"] for x in found.values()), len(found) - len(ahead) - len(behind)
-    text = f"- Compared with white noise in the paper's {len(found)} environments, {n_runs} runs: "
-    text += f"β = 0.5 learns more in {len(ahead)} ({', '.join(ahead)}), less in {len(behind)} "
-    return f"{text}({', '.join(behind)}). In the other {rest} these runs cannot tell.\n"
+    text = f"- In the paper's {len(found)} environments, {n_runs} runs, β = 0.5 learns more than "
+    text += f"white noise in {len(ahead)} ({', '.join(ahead)}), less in {len(behind)} "
+    return f"{text}({', '.join(behind)}); in {rest} these runs cannot tell.\n"
 
 
 def goals():
     """How many runs of Mountain Car end at the goal, which gives 100 where all else costs."""
     made, _ = complete("reproduction.csv", "study.csv", "new_seeds.csv")
-    made = made[(made.environment == "Mountain Car") & made.beta.isin(["0", "0.5", "1"])]
-    parts = []
-    for n_envs in (1, 4, 32):
-        cells = [made[(made.n_envs == n_envs) & ((made.beta == "0") == white)] for white in (0, 1)]
-        ours, white = (f"{(x.final_return > 0).sum()} of {len(x)}" for x in cells)
-        parts.append(f"{ours} against {white} with n_envs {n_envs}")
-    return f"Runs that end at its goal, β = 0.5 or 1 against white: {', '.join(parts)}.\n"
+    made = made[(made.environment == "Mountain Car") & made.n_envs.isin([1, 4, 32])]
+    cells = made[made.beta.isin(["0.5", "1"])], made[made.beta == "0"]
+    ours, white = (f"{(x.final_return > 0).sum()} of {len(x)}" for x in cells)
+    text = f"{ours} runs with β = 0.5 or 1 end at its goal, {white} with white noise"
+    return f"In the paper's tasks it matters most in Mountain Car: {text}.\n"
 
 
 def our_lead(n_envs, but=()):
@@ -179,17 +177,11 @@ def lead():
 
 
 def leads():
-    """Our leads of `lead`, in a sentence."""
-    parts = []
-    for n_envs, which, but in LEADS:
-        _, found, text = our_lead(n_envs, but)
-        where = (
-            f"of these, {which}" if which else f"environments, n_envs {', '.join(map(str, n_envs))}"
-        )
-        verdict = claims.judge(*interval(found))
-        parts.append(f"{text} ({found['environments']} {where}: {verdict})")
-    what = "Average lead of β = 0.5 over white noise, in standard deviations"
-    return f"{what}: {', '.join(parts)}.\n"
+    """The first three leads of `lead`, in a sentence."""
+    four, whole, without = (our_lead(n_envs, but)[2] for n_envs, _, but in LEADS[:3])
+    what = "Average lead of β = 0.5 over white noise in all 16 tasks, in standard deviations"
+    parts = f"{whole}, without Mountain Car {without}, with n_envs 4 alone {four}"
+    return f"{what}: {parts} ([more](results/README.md#what-the-paper-claims)).\n"
 
 
 def undecided():
@@ -251,12 +243,14 @@ def sign(text):
 
 
 def judged(leads, above="helps", below="hurts"):
-    """Text of the average of leads over white noise, with a verdict in the words of plans.md."""
+    """The verdict on the average of leads over white noise, in the words of plans.md."""
     average, stricter, similar = leads.iloc[-3:]
     found, checks = sign(average), {"at 98.3 %": stricter, "in tasks like these": similar}
-    also = " and ".join(name for name, text in checks.items() if found and sign(text) == found)
-    verdict = {1: f"it {above}", -1: f"it {below}", 0: "no difference found"}[found]
-    return f"{average}: {verdict}" + (f" ({also}, too)" if also else "")
+    if not found:
+        upper = average.split()[-1].rstrip("]")
+        return f"no difference found, a lead below {upper} is not excluded"
+    also = " and ".join(name for name, text in checks.items() if sign(text) == found)
+    return f"it {above if found > 0 else below}" + (f" ({also}, too)" if also else "")
 
 
 def gymnasium():
@@ -265,20 +259,23 @@ def gymnasium():
         made = len(complete("gymnasium.csv")[0])
         runs = f"{made} of [288 planned runs](results/plans.md)"
         return f"In Gymnasium's MuJoCo tasks {runs} are made: no answer yet.\n"
-    table, rows, tasks = questions.gymnasium().set_index("task"), [], []
+    table, lines, tasks = questions.gymnasium().set_index("task"), [], []
     for name, n_envs, n_steps in ("A", 1, 2048), ("B", 32, 128):
         half, pink = table[f"{name}: 0.5 over 0"], table[f"{name}: 1 over 0"].iloc[-3]
-        setting = f"n_envs {n_envs}, n_steps {n_steps}"
-        rows.append({"": setting, "β = 0.5": judged(half), "β = 1": pink})
+        text = f"- n_envs {n_envs}, n_steps {n_steps}: {half.iloc[-3]} with β = 0.5, {judged(half)}"
+        lines.append(f"{text}; {pink} with 1.")
         signs = half.iloc[:-3].map(sign)
         tasks += [f"helps in {task} (n_envs {n_envs})" for task in signs.index[signs > 0]]
         tasks += [f"hurts in {task} (n_envs {n_envs})" for task in signs.index[signs < 0]]
-    gain = judged(table["1 over 0: B less A"], "gains", "loses")
-    rows.append({"": "the second less the first", "β = 0.5": "", "β = 1": gain})
-    what = "Average lead over white noise in six of Gymnasium's MuJoCo tasks, usual settings"
+    gain = table["1 over 0: B less A"]
+    text = f"{gain.iloc[-3]}, {judged(gain, 'gains', 'loses')}"
+    lines.append(f"- β = 1, the second less the first: {text}.")
     found = ", ".join(tasks) or "makes no difference that is found"
-    averages = f"{what}, in standard deviations:\n\n{markdown(rows)}\n"
-    return f"{averages}In single tasks, at 99.2 %, β = 0.5 {found}.\n"
+    lines.append(f"- β = 0.5 in single tasks (99.2 %): {found}.")
+    where = "six of [Gymnasium's MuJoCo tasks](results/notes.md#gymnasiums-mujoco-tasks)"
+    what = f"Average lead over white noise in {where}, usual settings"
+    runs = "[288 planned runs](results/plans.md), in standard deviations of seeds"
+    return "\n".join([f"{what}, {runs}:\n", *lines, ""])
 
 
 def friction():

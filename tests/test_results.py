@@ -49,16 +49,18 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
     [  # in Ant-v5; averages at 95 %, at 98.3 % and for tasks like these
         (
             ["0.9 [0.1, 1.7]", "0.3 [0.01, 0.6]", "0.3 [-0.1, 0.6]", "0.3 [-0.9, 1.5]"],
-            *("it helps |", "it gains |", "helps in Ant-v5 (n_envs 32)."),
+            *(", it helps;", ", it gains.", "helps in Ant-v5 (n_envs 32)."),
         ),
         (
             ["-2 [-3, -1]", "-0.4 [-0.7, -0.1]", "-0.4 [-0.7, -0.06]", "-0.4 [-0.8, 0.01]"],
-            *("it hurts (at 98.3 %, too) |", "it loses (at 98.3 %, too) |"),
+            *(", it hurts (at 98.3 %, too);", ", it loses (at 98.3 %, too)."),
             "hurts in Ant-v5 (n_envs 32).",
         ),
         (
             ["0.9 [-0.1, 1.9]", "-0.2 [-0.5, 0.1]", "-0.2 [-0.5, 0.2]", "-0.2 [-0.9, 0.7]"],
-            *("no difference found |", "no difference found |", "no difference that is found."),
+            ", no difference found, a lead below 0.1 is not excluded;",
+            ", no difference found, a lead below 0.1 is not excluded.",
+            "no difference that is found.",
         ),
     ],
 )
@@ -69,9 +71,10 @@ def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, leads, verdict, gain, 
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
     cells = [*range(36)]
     monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)
-    *_, first, second, less, _, last = make.gymnasium().splitlines()
-    assert f"{leads[1]}: {verdict}" in first and f"{leads[1]}: {verdict}" in second
-    assert less.endswith(f"{leads[1]}: {gain}") and last.endswith(in_tasks)
+    *_, first, second, less, last = make.gymnasium().splitlines()
+    assert f"{leads[1]} with β = 0.5{verdict}" in first
+    assert f"{leads[1]} with β = 0.5{verdict}" in second
+    assert less.endswith(f"{leads[1]}{gain}") and last.endswith(in_tasks)
     cells.pop()
     monkeypatch.setattr(make, "complete", lambda file: (range(287), None))
     assert leads[1] not in make.gymnasium() and "287 of" in make.gymnasium()
