@@ -86,5 +86,6 @@ python -m study.runs pack gymnasium/ results/gymnasium.csv --overwrite
 
 # gymnasium_baseline.csv: why white noise is low in Ant-v5 and Swimmer-v5
 ./run_sweep.sh gymnasium --runs-dir baseline --envs Ant-v5 --betas 0 --n-envs 1 --seeds "1 2 3" -- --env-kwargs '{"include_cfrc_ext_in_observation": false}'
+./run_sweep.sh gymnasium --runs-dir baseline --envs Ant-v5 --betas "0 0.5" --n-envs 32 -- --env-kwargs '{"include_cfrc_ext_in_observation": false}'
 ./run_sweep.sh gymnasium --runs-dir baseline --envs Swimmer-v5 --betas 0 --n-envs 1 --seeds "1 2 3" -- --gamma 0.9999
 python -m study.runs pack baseline/ results/gymnasium_baseline.csv --overwrite
