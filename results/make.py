@@ -132,7 +132,7 @@ def goals():
     cells = made[made.beta.isin(["0.5", "1"])], made[made.beta == "0"]
     ours, white = (f"{(x.final_return > 0).sum()} of {len(x)}" for x in cells)
     text = f"{ours} runs with β = 0.5 or 1 end at its goal, {white} with white noise"
-    return f"In the paper's tasks it matters most in Mountain Car: {text}.\n"
+    return f"As in Mountain Car: {text}.\n"
 
 
 def our_lead(n_envs, but=()):
@@ -205,7 +205,8 @@ def undecided():
 def share():
     """How much of the study's main grid there is."""
     count, _, total = coverage().query("says == 'beta 0.5 is best on average'").runs.iloc[0].split()
-    return f"Ours are {count} of the study's {int(total):,} runs, with 3 of its 8 betas.\n"
+    text = f"Ours are {count} of the study's {int(total):,} runs, with 3 of its 8 betas"
+    return f"{text} ([where they differ](results/README.md#where-the-numbers-differ)).\n"
 
 
 def verdicts():
@@ -245,20 +246,17 @@ def sign(text):
 def judged(leads, above="helps", below="hurts"):
     """The verdict on the average of leads over white noise, in the words of plans.md."""
     average, stricter, similar = leads.iloc[-3:]
-    found, checks = sign(average), {"at 98.3 %": stricter, "in tasks like these": similar}
+    found = sign(average)
     if not found:
         upper = average.split()[-1].rstrip("]")
         return f"no difference found, a lead below {upper} is not excluded"
-    also = " and ".join(name for name, text in checks.items() if sign(text) == found)
-    return f"it {above if found > 0 else below}" + (f" ({also}, too)" if also else "")
+    where = ", in tasks like these, too" if sign(similar) == found else ""
+    strict = "also" if sign(stricter) == found else "open"
+    return f"it {above if found > 0 else below}{where} ({strict} at 98.3 %)"
 
 
 def gymnasium():
-    """What the runs of Gymnasium's tasks say, once there are all."""
-    if len(questions.gymnasium_scores()) < 36:  # cells with all their runs
-        made = len(complete("gymnasium.csv")[0])
-        runs = f"{made} of [288 planned runs](results/plans.md)"
-        return f"In Gymnasium's MuJoCo tasks {runs} are made: no answer yet.\n"
+    """What the runs of Gymnasium's tasks say."""
     table, lines, tasks = questions.gymnasium().set_index("task"), [], []
     for name, n_envs, n_steps in ("A", 1, 2048), ("B", 32, 128):
         half, pink = table[f"{name}: 0.5 over 0"], table[f"{name}: 1 over 0"].iloc[-3]
@@ -269,13 +267,12 @@ def gymnasium():
         tasks += [f"hurts in {task} (n_envs {n_envs})" for task in signs.index[signs < 0]]
     gain = table["1 over 0: B less A"]
     text = f"{gain.iloc[-3]}, {judged(gain, 'gains', 'loses')}"
-    lines.append(f"- β = 1, the second less the first: {text}.")
+    lines.append(f"- β = 1, from the first to the second: {text}.")
     found = ", ".join(tasks) or "makes no difference that is found"
     lines.append(f"- β = 0.5 in single tasks (99.2 %): {found}.")
     where = "six of [Gymnasium's MuJoCo tasks](results/notes.md#gymnasiums-mujoco-tasks)"
-    what = f"Average lead over white noise in {where}, usual settings"
     runs = "[288 planned runs](results/plans.md), in standard deviations of seeds"
-    return "\n".join([f"{what}, {runs}:\n", *lines, ""])
+    return "\n".join([f"In {where} (dense rewards, usual settings), {runs}:\n", *lines, ""])
 
 
 def friction():
@@ -329,9 +326,8 @@ def draw(folder):
     """Draws all figures to a folder; returns their paths."""
     todo = plot.results(*study_runs(), BETAS)
     runs, curves = complete("gymnasium.csv")
-    made = {task for task, _, _ in questions.gymnasium_scores()}
-    runs = runs[runs.env_id.isin(made)].astype({"beta": float})
     runs = runs.assign(panel=runs.environment + runs.n_envs.map(" {:03}".format))
+    runs = runs.astype({"beta": float})
     todo["gymnasium"] = (plot.learning_curves, runs, curves, "panel")
     tables = {todo[name][1] for name in FIGURES if isinstance(todo[name][1], str)}
     todo = {name: todo[name] for name in [*tables, *FIGURES]}

@@ -49,11 +49,12 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
     [  # in Ant-v5; averages at 95 %, at 98.3 % and for tasks like these
         (
             ["0.9 [0.1, 1.7]", "0.3 [0.01, 0.6]", "0.3 [-0.1, 0.6]", "0.3 [-0.9, 1.5]"],
-            *(", it helps;", ", it gains.", "helps in Ant-v5 (n_envs 32)."),
+            *(", it helps (open at 98.3 %);", ", it gains (open at 98.3 %)."),
+            "helps in Ant-v5 (n_envs 32).",
         ),
         (
             ["-2 [-3, -1]", "-0.4 [-0.7, -0.1]", "-0.4 [-0.7, -0.06]", "-0.4 [-0.8, 0.01]"],
-            *(", it hurts (at 98.3 %, too);", ", it loses (at 98.3 %, too)."),
+            *(", it hurts (also at 98.3 %);", ", it loses (also at 98.3 %)."),
             "hurts in Ant-v5 (n_envs 32).",
         ),
         (
@@ -64,20 +65,15 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
         ),
     ],
 )
-def test_gymnasium_is_judged_by_all_its_runs(monkeypatch, leads, verdict, gain, in_tasks):
+def test_gymnasium_is_judged_as_planned(monkeypatch, leads, verdict, gain, in_tasks):
     columns = ["A: 0.5 over 0", "A: 1 over 0", "B: 0.5 over 0", "B: 1 over 0", "1 over 0: B less A"]
     rows = {"task": ["Ant-v5", "these tasks, 95 %", "98.3 %", "tasks like these, 95 %"]}
     table = pd.DataFrame(rows | dict.fromkeys(columns, leads))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
-    cells = [*range(36)]
-    monkeypatch.setattr(make.questions, "gymnasium_scores", lambda: cells)
     *_, first, second, less, last = make.gymnasium().splitlines()
     assert f"{leads[1]} with β = 0.5{verdict}" in first
     assert f"{leads[1]} with β = 0.5{verdict}" in second
     assert less.endswith(f"{leads[1]}{gain}") and last.endswith(in_tasks)
-    cells.pop()
-    monkeypatch.setattr(make, "complete", lambda file: (range(287), None))
-    assert leads[1] not in make.gymnasium() and "287 of" in make.gymnasium()
 
 
 @pytest.mark.parametrize(("change", "same"), [(2, True), (200, False)])

@@ -1,7 +1,6 @@
 """study/questions.py on made-up runs, beside numbers that were put in."""
 
 import functools
-import itertools
 import re
 
 import numpy as np
@@ -66,14 +65,6 @@ def test_the_interval_of_these_tasks_holds_what_it_should(monkeypatch):
         _, low, high = numbers(table["average, these tasks, 95 %"])
         held += low < leads.mean() < high
     assert 0.9 <= held / 200 <= 0.99
-
-
-def test_a_task_counts_once_all_its_runs_are_made(monkeypatch):
-    cells = itertools.product(GYMNASIUM[:2], (1, 32), ("0", "0.5", "1"), range(8))
-    made = pd.DataFrame(cells, columns=["env_id", "n_envs", "beta", "seed"])[:-1]
-    curves = pd.DataFrame(np.zeros((len(made), 20)))
-    monkeypatch.setattr(questions, "complete", lambda file: (made, curves))
-    assert {task for task, _, _ in questions.gymnasium_scores()} == {GYMNASIUM[0]}
 
 
 def test_welchs_interval_and_the_order():
