@@ -193,6 +193,7 @@ def gymnasium_baseline():
     column, tasks = "this script (v5)", dict.fromkeys(task for task, _, _ in scores)
     ours = [{"task": task, "flag": "", column: mean_text(scores[task, 1, "0"])} for task in tasks]
     runs, curves = complete("gymnasium_baseline.csv")
+    runs = runs[runs.n_envs == 1]
     seeds = curves.iloc[:, -5:].mean(axis=1).map("{:.0f}".format)
     flags = differences(runs, ["env_kwargs", "gamma"])
     others = seeds.groupby([runs.env_id, flags]).agg(", ".join).rename_axis(["task", "flag"])
@@ -200,8 +201,20 @@ def gymnasium_baseline():
     return pd.concat([table, others.reset_index(name=column)]).fillna("")
 
 
+def gymnasium_ant():
+    """Gymnasium, Ant-v5 in B: mean of the last five evaluations, of eight seeds."""
+    runs, curves = complete("gymnasium_baseline.csv")
+    scores, last, rows = gymnasium_scores(), curves.iloc[:, -5:].mean(axis=1), []
+    usual = [scores["Ant-v5", 32, beta] for beta in ("0", "0.5")]
+    without = [last[(runs.n_envs == 32) & (runs.beta == beta)] for beta in ("0", "0.5")]
+    for name, (white, half) in ("usual", usual), ("without contact forces", without):
+        row = {"observation": name, "beta 0": mean_text(white), "beta 0.5": mean_text(half)}
+        rows.append(row | {"0.5 less 0": difference_text(half, white)})
+    return pd.DataFrame(rows)
+
+
 QUESTIONS = [stable_baselines3, pendulum_order, pendulum_beside_published, mountain_car, gymnasium]
-QUESTIONS += [gymnasium_area, gymnasium_baseline]
+QUESTIONS += [gymnasium_area, gymnasium_baseline, gymnasium_ant]
 
 
 def answers():

@@ -49,12 +49,18 @@ def test_leads_are_of_environments_with_all_cells(monkeypatch):
     [  # in Ant-v5; averages at 95 %, at 98.3 % and for tasks like these
         (
             ["0.9 [0.1, 1.7]", "0.3 [0.01, 0.6]", "0.3 [-0.1, 0.6]", "0.3 [-0.9, 1.5]"],
-            *(", it helps (open at 98.3 %);", ", it gains (open at 98.3 %)."),
+            *(
+                ", it helps (corrected for three tests: open);",
+                ", it gains (corrected for three tests: open).",
+            ),
             "helps in Ant-v5 (n_envs 32).",
         ),
         (
             ["-2 [-3, -1]", "-0.4 [-0.7, -0.1]", "-0.4 [-0.7, -0.06]", "-0.4 [-0.8, 0.01]"],
-            *(", it hurts (also at 98.3 %);", ", it loses (also at 98.3 %)."),
+            *(
+                ", it hurts (corrected for three tests: too);",
+                ", it loses (corrected for three tests: too).",
+            ),
             "hurts in Ant-v5 (n_envs 32).",
         ),
         (
