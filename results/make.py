@@ -253,14 +253,14 @@ def gymnasium():
     table, lines, tasks = questions.gymnasium().set_index("task"), [], []
     for name, n_envs, n_steps in ("A", 1, 2048), ("B", 32, 128):
         half, pink = table[f"{name}: 0.5 over 0"], table[f"{name}: 1 over 0"].iloc[-3]
-        text = f"- n_envs {n_envs}, n_steps {n_steps}: {half.iloc[-3]} with β = 0.5, {judged(half)}"
-        lines.append(f"{text}; {pink} with 1.")
+        text = f"- n_envs {n_envs}, n_steps {n_steps}, β = 0.5: {half.iloc[-3]}, {judged(half)}"
+        lines.append(f"{text}; β = 1: {pink}.")
         signs = half.iloc[:-3].map(sign)
         tasks += [f"helps in {task} (n_envs {n_envs})" for task in signs.index[signs > 0]]
         tasks += [f"hurts in {task} (n_envs {n_envs})" for task in signs.index[signs < 0]]
     gain = table["1 over 0: B less A"]
     text = f"{gain.iloc[-3]}, {judged(gain, 'gains', 'loses')}"
-    lines.append(f"- The second lead of β = 1 less the first: {text}.")
+    lines.append(f"- The lead of β = 1, second less first: {text}.")
     found = ", ".join(tasks) or "makes no difference that is found"
     lines.append(f"- β = 0.5 in single tasks (corrected for six): {found}.")
     return "\n".join([*lines, ""])

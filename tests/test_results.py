@@ -77,8 +77,8 @@ def test_gymnasium_is_judged_as_planned(monkeypatch, leads, verdict, gain, in_ta
     table = pd.DataFrame(rows | dict.fromkeys(columns, leads))
     monkeypatch.setattr(make.questions, "gymnasium", lambda: table)
     *_, first, second, less, last = make.gymnasium().splitlines()
-    assert f"{leads[1]} with β = 0.5{verdict}" in first
-    assert f"{leads[1]} with β = 0.5{verdict}" in second
+    assert f"β = 0.5: {leads[1]}{verdict}" in first
+    assert f"β = 0.5: {leads[1]}{verdict}" in second
     assert less.endswith(f"{leads[1]}{gain}") and last.endswith(in_tasks)
 
 
