@@ -238,14 +238,13 @@ def sign(text):
 
 def judged(leads, above="helps", below="hurts"):
     """The verdict on the average of leads over white noise, in the words of plans.md."""
-    average, corrected, similar = leads.iloc[-3:]
+    average, corrected, _ = leads.iloc[-3:]
     found = sign(average)
     if not found:
         upper = average.split()[-1].rstrip("]")
         return f"no difference found, a lead below {upper} is not excluded"
-    where = ", in tasks like these, too" if sign(similar) == found else ""
     also = "too" if sign(corrected) == found else "open"
-    return f"it {above if found > 0 else below}{where} (corrected for three tests: {also})"
+    return f"it {above if found > 0 else below} (corrected for three tests: {also})"
 
 
 def gymnasium():

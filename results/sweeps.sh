@@ -84,7 +84,8 @@ python -m study.runs pack sb3/ results/sb3.csv --overwrite
 ./run_sweep.sh gymnasium --runs-dir gymnasium
 python -m study.runs pack gymnasium/ results/gymnasium.csv --overwrite
 
-# gymnasium_baseline.csv: why white noise is low in Ant-v5 and Swimmer-v5
+# gymnasium_baseline.csv: why white noise is low in Ant-v5 and Swimmer-v5, and whether the lead of
+# beta 0.5 in Ant-v5 hangs on it
 ./run_sweep.sh gymnasium --runs-dir baseline --envs Ant-v5 --betas 0 --n-envs 1 --seeds "1 2 3" -- --env-kwargs '{"include_cfrc_ext_in_observation": false}'
 ./run_sweep.sh gymnasium --runs-dir baseline --envs Ant-v5 --betas "0 0.5" --n-envs 32 -- --env-kwargs '{"include_cfrc_ext_in_observation": false}'
 ./run_sweep.sh gymnasium --runs-dir baseline --envs Swimmer-v5 --betas 0 --n-envs 1 --seeds "1 2 3" -- --gamma 0.9999

@@ -126,12 +126,12 @@ def mountain_car():
     return pd.DataFrame(rows).fillna("")
 
 
-def gymnasium_scores(last=5):
+def gymnasium_scores(last=5, file="gymnasium.csv"):
     """Scores of the runs of `run_sweep.sh gymnasium`: {(task, n_envs, beta): (seeds,)}.
 
     The mean of a run's last evaluations; of all twenty it is the area under the curve.
     """
-    runs, curves = complete("gymnasium.csv")
+    runs, curves = complete(file)
     scores = curves.dropna(axis=1).iloc[:, -last:].mean(axis=1)
     return scores.groupby([runs.env_id, runs.n_envs, runs.beta]).apply(np.array).to_dict()
 
@@ -203,11 +203,10 @@ def gymnasium_baseline():
 
 def gymnasium_ant():
     """Gymnasium, Ant-v5 in B: mean of the last five evaluations, of eight seeds."""
-    runs, curves = complete("gymnasium_baseline.csv")
-    scores, last, rows = gymnasium_scores(), curves.iloc[:, -5:].mean(axis=1), []
-    usual = [scores["Ant-v5", 32, beta] for beta in ("0", "0.5")]
-    without = [last[(runs.n_envs == 32) & (runs.beta == beta)] for beta in ("0", "0.5")]
-    for name, (white, half) in ("usual", usual), ("without contact forces", without):
+    usual, without = gymnasium_scores(), gymnasium_scores(file="gymnasium_baseline.csv")
+    rows = []
+    for name, scores in ("usual", usual), ("without contact forces", without):
+        white, half = scores["Ant-v5", 32, "0"], scores["Ant-v5", 32, "0.5"]
         row = {"observation": name, "beta 0": mean_text(white), "beta 0.5": mean_text(half)}
         rows.append(row | {"0.5 less 0": difference_text(half, white)})
     return pd.DataFrame(rows)
